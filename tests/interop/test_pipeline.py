@@ -11,7 +11,7 @@ from astropy.io import fits
 from ruamel.yaml import YAML
 from scipy.io import loadmat
 from support.compiled import Compiled
-from support.exports import relative
+from support.exports import CacaoProgram, DifferenceEquation, relative
 from support.lqg import slow_plant
 from support.recorded_runs import recorded_run
 from support.refusals import require_refusals
@@ -87,8 +87,8 @@ def taps(hardware):
     return [0.0] * whole + [1 - part, part]
 
 
-def decays(hardware, step):
-    """Whether a loop in any arithmetic comes back from a kick, with ``step(y) -> u``.
+def decays(hardware, program):
+    """Whether a loop in any arithmetic comes back from a kick.
 
     A slow line may still swing up when the first frames are over.
     """
@@ -96,7 +96,7 @@ def decays(hardware, step):
     sizes = []
     for frames in (FRAMES, 16 * FRAMES):
         while len(sizes) < frames:
-            past = [step(residual), *past[:-1]]
+            past = [program.step(residual), *past[:-1]]
             residual = -sum(c * v for c, v in zip(taps(hardware), past, strict=True))
             sizes.append(np.max(np.abs(residual)))
             if not sizes[-1] < 1e30:
@@ -107,40 +107,31 @@ def decays(hardware, step):
     return False
 
 
-def run_c(files, hardware, options):
-    """Run the compiled source, which is given its own commands as those that were applied."""
-    return Compiled(files[0], single=options.get("precision") == "single").step
+class Running:
+    """A program that steps files, just started."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def reset(self):
+        pass
 
 
-def run_matlab(files, hardware, options):
+def run_matlab(files, *_):
     """Step ``ss(A, B, C, D)`` as MATLAB does."""
     form = loadmat(files[0])["textbook"][0, 0]
     A, B, C, D = (form[name] for name in "ABCD")
-    state = [np.zeros(len(A))]
+    state = np.zeros(len(A))
 
-    def run(y):
-        u = C @ state[0] + D @ y
-        state[0] = A @ state[0] + B @ y
+    def step(y):
+        u = C @ state + D @ y
+        state[:] = A @ state + B @ y
         return u
 
-    return run
+    return Running(step)
 
 
-def run_dao(files, hardware, options):
-    """Take the rows of the matrix: ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``."""
-    b, a = np.split(np.load(files[0]), [len(np.load(files[0])) // 2 + 1])
-    inputs, outputs = np.zeros_like(b), np.zeros_like(a)
-
-    def run(y):
-        inputs[:] = np.vstack([y, inputs[:-1]])
-        u = np.sum(b * inputs, axis=0) + np.sum(a * outputs, axis=0)
-        outputs[:] = np.vstack([u, outputs[:-1]])
-        return u.astype(float)
-
-    return run
-
-
-def run_pyrtc(files, hardware, options):
+def run_pyrtc(files, hardware, _):
     """Run the predictor as pyRTC does."""
     conf = YAML(typ="safe").load(files[0])["loop"]["predictor"]
     delay, gain_file = conf["delay_frames"], files[0].with_name(conf["gain_file"])
@@ -148,38 +139,21 @@ def run_pyrtc(files, hardware, options):
     predictor = GainFilePredictor(hardware.modes, delay, **others)
     sent = [np.zeros(hardware.modes, dtype=np.float32)] * delay  # with pyRTC's sign
 
-    def run(y):
+    def step(y):
         predictor.update(y.astype(np.float32) - sent[0])
         sent[:] = [*sent[1:], (-predictor.predict()).astype(np.float32)]
         return -sent[-1].astype(float)
 
-    return run
-
-
-def run_cacao(files, hardware, options):
-    """Multiply the history of pseudo-open-loop values, whose mirror has cacao's sign."""
-    matrix = fits.getdata(files[0]).astype(np.float32)
-    history = np.zeros((matrix.shape[1] // len(matrix), len(matrix)), dtype=np.float32)
-    past = [np.zeros(len(matrix), dtype=np.float32) for _ in taps(hardware)]
-
-    def run(y):
-        correction = sum(np.float32(c) * v for c, v in zip(taps(hardware), past, strict=True))
-        history[:] = np.vstack([y.astype(np.float32) - correction, history[:-1]])
-        past[:] = [matrix @ history.ravel(), *past[:-1]]
-        return -past[0].astype(float)
-
-    return run
+    return Running(step)
 
 
 ORACLES = {
-    "c": run_c,
-    "cacao": run_cacao,
-    "dao": run_dao,
+    "c": lambda files, _, options: Compiled(files[0], single=options.get("precision") == "single"),
+    "cacao": lambda files, path, _: CacaoProgram(fits.getdata(files[0]), path.delay_frames + 1),
+    "dao": lambda files, *_: DifferenceEquation(np.load(files[0])),
     "matlab": run_matlab,
     "pyrtc": run_pyrtc,
 }
-
-
 FILES = {"k.c": "c", "k.mat": "matlab", "k.npy": "dao"}
 PATH = lbt.LoopHardware(frame_rate_hz=800)
 PHASE = 100 * np.cumsum(np.random.default_rng(0).standard_normal((1500, 2)), axis=0) / 30
@@ -219,8 +193,8 @@ def written_stable(folder, seeds):
                 files = lbt.interop.export(place, design, name, **options).files
             except (lbt.errors.NumericalError, lbt.errors.ProblemError):
                 continue
-            step = oracle(files, design.hardware, options)
-            assert decays(design.hardware, step), (name, seed)
+            program = oracle(files, design.hardware, options)
+            assert decays(design.hardware, program), (name, seed)
             written[name] += 1
     return written
 
@@ -410,16 +384,6 @@ def test_what_cannot_be_rehearsed_is_refused(tmp_path, slow, monkeypatch):
 GAINS = [0.0, 0.0, 0.5, 0.3, 0.0, 0.5]
 
 
-class Running:
-    """A program that steps files, as a controller of the package."""
-
-    def __init__(self, step):
-        self.step = step
-
-    def reset(self):
-        """It has just been started."""
-
-
 def modal_cases(design):
     """What is exported, its options, the controller that it is, and which modes are proved."""
     air = lbt.models.ARModel(coefficients=[0.98], driving_rms_nm=20.0, frame_rate_hz=800)
@@ -458,7 +422,7 @@ def test_files_of_all_modes_are_the_controller(tmp_path, designs, kind, name, op
     path = lbt.LoopHardware(frame_rate_hz=800, modes=control.n_modes)
     steps, noise = np.random.default_rng(4).standard_normal((2, 600, path.modes))
     steps[:5] = noise[:5] = 0  # until pyRTC's loop runs
-    runs = [control, Running(ORACLES[name](written.files, path, options))]
+    runs = [control, ORACLES[name](written.files, path, options)]
     runs += [written.start(np.inf)] * (name != "pyrtc")  # whose twin has the modes of the design
     expected, *commands = (
         np.split(recorded_run(run, path, np.cumsum(steps, axis=0), 0.1 * noise)[0], 3, axis=1)[1]
@@ -467,6 +431,6 @@ def test_files_of_all_modes_are_the_controller(tmp_path, designs, kind, name, op
     for series in commands:
         assert relative(series, expected) < limit
         assert np.array_equal(series.any(axis=0), expected.any(axis=0))  # no gain, no command
-    assert name != "c" or np.array_equal(*commands)
+    assert all(np.array_equal(commands[0], twin) for twin in commands[1:])
     names = [check.name for check in written.checks if "residual at sensor gain 1," in check.name]
     assert sorted(name.split(" (")[1].removesuffix(")") for name in names) == proved

@@ -8,15 +8,8 @@ import subprocess
 
 import numpy as np
 
-STRICT = [
-    "-std=c99",
-    "-pedantic",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-    "-Wdouble-promotion",
-    "-Wconversion",
-]
+STRICT = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion"]
+STRICT += ["-Wconversion"]
 PLAIN = ["-O2", "-ffp-contract=off"]  # each product and each sum is rounded
 _fresh = itertools.count()
 _compiled = {}
@@ -43,10 +36,9 @@ def build(source):
 
 def header_numbers(source, name):
     """Return the whole numbers that a header defines, by name without the prefix."""
-    found = re.findall(
-        rf"{name.upper()}_(\w+) (?:= )?(\d+)\b", source.with_suffix(".h").read_text()
-    )
-    return {key: int(value) for key, value in found}
+    header = source.with_suffix(".h").read_text()
+    numbers = re.findall(rf"{name.upper()}_(\w+) (?:= )?(\d+)\b", header)
+    return {key: int(value) for key, value in numbers}
 
 
 class Compiled:

@@ -27,11 +27,8 @@ def given_design():
     (frequency, damping, rms), *_ = LINE
     line = lbt.Vibration(frequency_hz=frequency, damping=damping, rms_nm=rms, direction=(1,))
     air = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=1.0, frame_rate_hz=RATE)
-    return lbt.kalman(
-        lbt.tip_tilt_plant(
-            frame_rate_hz=RATE, turbulence=air, vibrations=[line], noise_nm=2.0, modes=1
-        )
-    )
+    models = {"turbulence": air, "vibrations": [line], "noise_nm": 2.0}
+    return lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=RATE, modes=1, **models))
 
 
 def short_record(change=1.0, *, frames=1000, axes=1):

@@ -16,27 +16,18 @@ from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 @functools.cache
 def odd_plant():
     """A plant whose sensor, mirror, noise and delay are not the simplest."""
-    plant = lbt_axis_plant(modes=2)
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=800,
-        turbulence=plant.turbulence,
-        vibrations=plant.vibrations,
+    return slow_plant(
+        2.5,
+        modes=2,
         noise_nm=[15.5, 20.0],
-        delay_frames=2.5,
         sensor_matrix=[[1.1, 0.1], [-0.1, 0.9]],
         influence_matrix=[[0.9, 0.0], [0.1, 1.2]],
     )
 
 
 def bare_problem():
-    return lbt.EstimationProblem(
-        A=[[1.9, -0.99], [1.0, 0.0]],
-        B=[[1.0, 0.0], [0.0, 0.0]],
-        C=[[0.0, 1.0]],
-        D=[[0.0, 3.0]],
-        L=[[1.0, 0.0]],
-        dt_s=0.002,
-    )
+    A, B, D = [[1.9, -0.99], [1.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[0.0, 3.0]]
+    return lbt.EstimationProblem(A=A, B=B, C=[[0.0, 1.0]], D=D, L=[[1.0, 0.0]], dt_s=0.002)
 
 
 def sensors_original(*, bounded):

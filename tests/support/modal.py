@@ -1,7 +1,5 @@
 """Turbulence and vibrations of many modes."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np
@@ -19,12 +17,12 @@ HUM = lbt.Vibration(frequency_hz=55, damping=0.02, rms_nm=40.0, direction=(1,))
 
 
 @functools.cache
-def tip_tilt_filter(delay_frames: float = 2.0) -> lbt.design.FilterDesign:
+def tip_tilt_filter(delay_frames=2.0):
     """The Kalman filter of the LBT's numbers on both axes."""
     return lbt.kalman(lbt_axis_plant(modes=2, delay_frames=delay_frames))
 
 
-def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ARModel:
+def some_air(n, order=1, seed=0):
     rng = np.random.default_rng(seed)
     if order == 1:
         coefficients = rng.uniform(0.9, 0.995, (n, 1))
@@ -37,14 +35,9 @@ def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ARModel:
 
 
 def single_plant(air, mode, lines, noise, gain, **path):
+    models = {"turbulence": air.take(mode), "vibrations": lines, "noise_nm": float(noise)}
     return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE,
-        turbulence=air.take(mode),
-        vibrations=lines,
-        noise_nm=float(noise),
-        sensor_gain=float(gain),
-        modes=1,
-        **path,
+        frame_rate_hz=RATE, sensor_gain=float(gain), modes=1, **models, **path
     )
 
 
@@ -95,19 +88,17 @@ def joint_controller(parts, n):
 
 def integrator_run(gains, total, noise, *, sensor_gain=1.0, hardware=None):
     """Return measurements and commands, (frames, n) each, of an integrator for each mode."""
-    hardware = (hardware or path_of()).single_mode()
-    sensor_gains = np.broadcast_to(sensor_gain, len(total))
-    runs = [
-        lbt.simulate(
-            lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=hardware.dt_s),
-            lbt.loop.Disturbance(
-                phase_nm=phase[:, None], noise=own[:, None], sensor_gain=real, frame_means=True
-            ),
-            hardware=hardware,
+    path = (hardware or path_of()).single_mode()
+    runs = []
+    for gain, phase, own, real in zip(
+        gains, total, noise, np.broadcast_to(sensor_gain, len(total)), strict=True
+    ):
+        law = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=path.dt_s)
+        facts = {"noise": own[:, None], "sensor_gain": real, "frame_means": True}
+        runs.append(
+            lbt.simulate(law, lbt.loop.Disturbance(phase_nm=phase[:, None], **facts), hardware=path)
         )
-        for gain, phase, own, real in zip(gains, total, noise, sensor_gains, strict=True)
-    ]
     return tuple(
-        np.stack([getattr(run, name)[0, :, 0] for run in runs], axis=1)
-        for name in ("measurements", "commands")
+        np.stack([series[0, :, 0] for series in kind], axis=1)
+        for kind in zip(*((run.measurements, run.commands) for run in runs), strict=True)
     )

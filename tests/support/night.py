@@ -3,6 +3,7 @@
 from functools import cache
 
 from support.recorded_loops import RATE, slow
+from support.records import record
 
 import lbt_synth as lbt
 
@@ -22,10 +23,4 @@ def simulated_night():
 def night_record():
     """The record of the simulated night, as telemetry would hold it."""
     run, path, _ = simulated_night()
-    return lbt.identification.loop_record(
-        run.measurements[0],
-        run.commands[0],
-        frame_rate_hz=path.frame_rate_hz,
-        delay_frames=path.delay_frames,
-        unit="nm",
-    )
+    return record(run, path)

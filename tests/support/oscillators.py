@@ -1,7 +1,5 @@
 """Continuous oscillators, shaken by kicks within each frame, without the package's sampling."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A page with every kind of block and mark, and what tests read out of pages."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 import numpy as np
@@ -26,11 +24,9 @@ VOID = {"meta", "br", "hr", "img", "input", "link"}
 class Reader(HTMLParser):
     """Elements of a page in their order, with what is inside; refuses what is not well formed."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.stack: list[str] = []
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.texts: dict[str, list[str]] = {}
+        self.stack, self.elements, self.texts = [], [], {}
         self.feed(text)
         self.close()
         assert self.stack == []
@@ -57,7 +53,7 @@ class Reader(HTMLParser):
         return [attributes for name, attributes in self.elements if name == tag]
 
 
-def every_mark(name: str = "first") -> tuple[Chart, ...]:
+def every_mark(name="first"):
     """Charts with every kind of mark."""
     f, frequency = np.geomspace(0.1, 400, 50), ("frequency", "Hz")
     with drawing([PANEL_IN, PANEL_IN]) as (above, below):
@@ -87,7 +83,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
     return lines, Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
 
 
-def whole_page(name: str = "first") -> Page:
+def whole_page(name="first"):
     """A page with every kind of block."""
     table = Table(
         caption=f"Table of {name}",

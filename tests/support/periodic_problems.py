@@ -18,16 +18,10 @@ def random_periodic_problem(seed, *, varying=True, radius=1.1):
     read = rng.random((N, q)) < 0.4
     read[0] = True
     units = 10.0 ** rng.uniform(-5, 2, (q, 1))
-    return EstimationProblem(
-        A=A,
-        B=rng.standard_normal((1, n, n + q)),
-        C=units * rng.standard_normal((1, q, n)),
-        D=(units * np.hstack([0.3 * rng.standard_normal((q, n)), np.diag(rng.uniform(0.3, 3, q))]))[
-            None
-        ],
-        L=rng.standard_normal((2, n)),
-        read=read,
-    )
+    B, C = rng.standard_normal((1, n, n + q)), units * rng.standard_normal((1, q, n))
+    D = np.hstack([0.3 * rng.standard_normal((q, n)), np.diag(rng.uniform(0.3, 3, q))])
+    L = rng.standard_normal((2, n))
+    return EstimationProblem(A=A, B=B, C=C, D=(units * D)[None], L=L, read=read)
 
 
 def relative_distance(own, expected):

@@ -39,20 +39,15 @@ def synthetic(folder):
     The sensor runs at its own pace and sees no disturbance yet; the loop is calibrated.
     """
     conf = yaml.safe_load((folder / "config.yaml").read_text())
-    modes = conf["wfc"]["num_modes"]
     grid = {"sub_ap_spacing": 8, "sub_ap_offset_x": 0, "sub_ap_offset_y": 0}
     conf["wfs"] = {
         "class_name": "SyntheticSHWFS",
         "functions": ["expose"],
         "name": "sensor",
-        "width": 32,
-        "height": 32,
-        "dark_count": 10,
-        "num_modes": modes,
-        "frame_rate_hz": SENSOR_HZ,
-        "read_noise": 1.0,
         **grid,
     }
+    conf["wfs"] |= {"width": 32, "height": 32, "dark_count": 10, "read_noise": 1.0}
+    conf["wfs"] |= {"num_modes": conf["wfc"]["num_modes"], "frame_rate_hz": SENSOR_HZ}
     conf["slopes"] = {"type": "SHWFS", "signal_type": "slopes", "functions": ["compute_signal"]}
     conf["slopes"] |= grid
     del conf["loop"]["im_file"]
@@ -128,16 +123,14 @@ def _give_up(*_):
 def drawn(truth, hardware, *, frames, seed, quiet=0):
     """Phase and noise, (1, frames, modes); both are zero in the first frames."""
     series = draw_disturbance(truth, hardware, frames=frames, seed=seed)
-    total, noise = series.phase_nm, series.noise
-    total[:, :quiet] = 0
-    noise[:, :quiet] = 0
-    return total, noise
+    for values in (series.phase_nm, series.noise):
+        values[:, :quiet] = 0
+    return series.phase_nm, series.noise
 
 
 def pol_series(truth, hardware, *, frames, seed):
     """What an open loop records, (frames, modes)."""
-    total, noise = drawn(truth, hardware, frames=frames, seed=seed)
-    return (total + noise)[0]
+    return sum(drawn(truth, hardware, frames=frames, seed=seed))[0]
 
 
 def residual_rms(series, modes=2):

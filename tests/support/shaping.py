@@ -27,10 +27,8 @@ def margin(at_least):
 
 def attenuation(low_hz, high_hz, at_most, sensor_gain=1.0):
     """Return the demand of a rejection in a band."""
-    ends = {"low_hz": low_hz, "high_hz": high_hz}
-    return lbt.design.shaping.Bound(
-        response="rejection", at_most=at_most, sensor_gain=sensor_gain, **ends
-    )
+    ends = {"low_hz": low_hz, "high_hz": high_hz, "sensor_gain": sensor_gain}
+    return lbt.design.shaping.Bound(response="rejection", at_most=at_most, **ends)
 
 
 def spec(*demands, terms=(BASIC,)):
@@ -50,13 +48,11 @@ def random_coefficients(size, seed=0):
 @functools.cache
 def shaped_design():
     """A shaped design of few states."""
-    demands = (
-        margin(0.5),
-        lbt.design.shaping.CommandRms(at_most_nm=200, turbulence=SLOW, noise_nm=NOISE, rate=True),
-    )
+    shaping = lbt.design.shaping
     table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 10, 100], density_nm2_hz=[500, 20, 0.1])
     terms = (
-        lbt.design.shaping.ResidualVariance(turbulence=table, noise_nm=NOISE),
-        lbt.design.shaping.VibrationBand(low_hz=9, high_hz=11, rms_nm=50),
+        shaping.ResidualVariance(turbulence=table, noise_nm=NOISE),
+        shaping.VibrationBand(low_hz=9, high_hz=11, rms_nm=50),
     )
-    return lbt.design.shape(ONE, spec(*demands, terms=terms), functions=16, states=10)
+    rate = shaping.CommandRms(at_most_nm=200, turbulence=SLOW, noise_nm=NOISE, rate=True)
+    return shaped(margin(0.5), rate, terms=terms, functions=16, states=10)

@@ -6,8 +6,6 @@ so each precision is a process of its own::
     python tests/support/specula_filters.py PRECISION OUTPUT.npz CONFIG FILE ...
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from astropy.io import fits
+from support.exports import CacaoProgram
 from support.recorded_runs import recorded_run
 from support.refusals import require_refusals
 from support.shaping import attenuation, shaped
@@ -224,38 +225,14 @@ def test_what_the_filter_cannot_hold_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def reference(matrix, latency, series):
-    """Frame by frame as modalfilter.c and applyPF.c do, with their ring and their indices."""
-    single = np.float32
-    matrix = np.asarray(matrix, single)
-    modes, columns = matrix.shape
-    ring, write = np.zeros((10, modes), single), 0
-    inbuff = np.zeros(columns, single)
-    whole = int(latency)
-    part = single(latency - whole)
-    out = []
-    for y in np.asarray(series, single):
-        # the command of this frame is written after it is known, where index 0 frames ago is
-        now = (write + 1) % 10
-        one, two = (now - whole) % 10, (now - whole - 1) % 10
-        late = (part * ring[two]).astype(float) + (1.0 - float(part)) * ring[one].astype(float)
-        inbuff[:modes] = y - late.astype(single)
-        applied = np.zeros(modes, single)
-        for i in range(columns):
-            applied = applied + inbuff[i] * matrix[:, i]
-        inbuff[modes:] = inbuff[:-modes].copy()
-        ring[write] = applied
-        write = now
-        out.append(-applied)
-    return np.array(out, dtype=float)
-
-
 @pytest.mark.parametrize("delay", [1.0, 2.0, 2.25, 8.0])
 def test_every_bit_is_that_of_the_program(delay):
     rng = np.random.default_rng(1)
     matrix, series = rng.standard_normal((2, 10)) / 4, rng.standard_normal((40, 2))
     run = AppliedFilter(matrix, delay)
+    program = CacaoProgram(matrix, delay + 1)
     for _ in range(2):
-        found = np.array([run.step(y) for y in series])
-        assert np.array_equal(found, reference(matrix, delay + 1, series))
+        found, expected = ([k.step(y) for y in series.astype(np.float32)] for k in (run, program))
+        assert np.array_equal(found, expected)
         run.reset()
+        program.reset()

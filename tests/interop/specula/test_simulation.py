@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from support.end_to_end import make_run
+from support.refusals import require_refusals
 from support.sensor_loops import sinusoid_reading
 from support.small_telescope import PATH, PLANT, SETUP, SHAKE, needs_specula
 
@@ -17,28 +18,13 @@ from lbt_synth.loop.disturbances import draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 
-def test_a_run_needs_a_controller_with_steps(setup):
-    with pytest.raises(ProblemError, match="step"):
-        run_end_to_end(setup, object())
-
-
 @needs_specula
 @pytest.mark.parametrize(("method", "delay"), [("integrator", 2.5), ("kalman", 2.0)])
 def test_in_the_linear_range_it_is_the_modal_loop(calibration, method, delay):
     """A vibration of 60 nm and a bright star: residual and gain as the exact analysis says."""
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay)
     setup = replace(SETUP, hardware=path, vibrations=(SHAKE,), settle_frames=300)
-    if method == "integrator":
-        design = lbt.integrator(path, gain=0.3)
-    else:
-        plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800,
-            delay_frames=delay,
-            turbulence=PLANT.turbulence[0],
-            noise_nm=0.3,
-            vibrations=PLANT.vibrations,
-        )
-        design = lbt.kalman(plant)
+    design = lbt.kalman(PLANT) if method == "kalman" else lbt.integrator(path, gain=0.3)
     run = run_end_to_end(setup, design, calibration=calibration)
     assert run.tip_tilt_gain == pytest.approx(1.0, abs=0.05)
     truth = lbt.Truth(turbulence=None, vibrations=(SHAKE,), sensor_gain=run.tip_tilt_gain)
@@ -97,16 +83,6 @@ def test_leaks_and_gains_of_the_mixed_controller(setup):
     assert second[50] == pytest.approx(setup.leak * setup.gain)
 
 
-def test_a_filter_of_another_loop_or_mirror_is_refused(setup):
-    other = lbt.integrator(lbt.LoopHardware(frame_rate_hz=1000), gain=0.5)
-    with pytest.raises(ProblemError, match=r"1000 Hz and 2 frames"):
-        mix_controller(setup, other)
-    slow = lbt.load_config("examples/lbt_slow_mirror.yaml")
-    with pytest.raises(ProblemError, match="another mirror"):
-        mix_controller(setup, lbt.lqg(slow.plant))
-    assert mix_controller(slow.end_to_end, lbt.lqg(slow.plant)).n_modes == 672
-
-
 def test_the_optical_gain_is_found_within_its_error(setup):
     run = make_run(replace(setup, modes=60))
     gain, error, _ = run.optical_gain()
@@ -152,18 +128,12 @@ def dim_filter(*sensors, modes=2, noise_nm=15.0, **changes):
             frequency_hz=shake.frequency_hz,
             damping=0.005,
             rms_nm=shake.rms_nm,
-            direction=shake.direction[:modes] if modes == 2 else (1,),
+            direction=shake.direction if modes == 2 else (1,),
         )
         for shake in SHAKES
     ]
-    own = lbt.tip_tilt_plant(
-        frame_rate_hz=800,
-        turbulence=lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=0.5, frame_rate_hz=800),
-        noise_nm=noise_nm,
-        vibrations=lines,
-        modes=modes,
-        **changes,
-    )
+    models = {"turbulence": PLANT.turbulence[0], "noise_nm": noise_nm, "vibrations": lines}
+    own = lbt.tip_tilt_plant(frame_rate_hz=800, modes=modes, **models, **changes)
     suite = SensorSuite(sensors=sensors or (MIRROR,))
     motions = MOTIONS if suite.channels else ()
     return lbt.kalman(own.with_sensors(suite, motions))
@@ -209,13 +179,27 @@ def test_a_further_wavefront_sensor_is_not_read(shaking):
     np.testing.assert_allclose(steps[0], steps[1], rtol=1e-6, atol=1e-9)
 
 
-def test_filters_that_do_not_fit_are_refused(shaking):
-    with pytest.raises(ProblemError, match=r"moves a channel of the design \(m1, m2\)"):
-        mix_controller(replace(SETTINGS, motions=({}, {})), shaking)
-    with pytest.raises(DimensionError, match="two measurements .* got 1 to 1"):
-        mix_controller(SETTINGS, dim_filter(TRUTH_SENSOR, modes=1))
-    with pytest.raises(ProblemError, match="800 Hz and 2.5 frames"):
-        mix_controller(SETTINGS, dim_filter(replace(MIRROR, delay_frames=2), delay_frames=2.5))
+def test_controllers_that_do_not_fit_are_refused(setup, shaking):
+    """Another loop, mirror or motion of a channel, other modes, or no steps."""
+    mirror = lbt.load_config("examples/lbt_slow_mirror.yaml")
+    slow = lbt.lqg(mirror.plant)
+    assert mix_controller(mirror.end_to_end, slow).n_modes == 672
+    other = lbt.integrator(lbt.LoopHardware(frame_rate_hz=1000), gain=0.5)
+    late = dim_filter(replace(MIRROR, delay_frames=2), delay_frames=2.5)
+    single, still = dim_filter(TRUTH_SENSOR, modes=1), replace(SETTINGS, motions=({}, {}))
+
+    def mix(*arguments):
+        return lambda: mix_controller(*arguments)
+
+    rows = [
+        (lambda: run_end_to_end(setup, object()), ProblemError, "step"),
+        (mix(setup, other), ProblemError, r"1000 Hz and 2 frames"),
+        (mix(setup, slow), ProblemError, "another mirror"),
+        (mix(still, shaking), ProblemError, r"moves a channel of the design \(m1, m2\)"),
+        (mix(SETTINGS, single), DimensionError, "two measurements .* got 1 to 1"),
+        (mix(SETTINGS, late), ProblemError, "800 Hz and 2.5 frames"),
+    ]
+    require_refusals(rows)
 
 
 @needs_specula
