@@ -157,6 +157,7 @@ ORACLES = {
 FILES = {"k.c": "c", "k.mat": "matlab", "k.npy": "dao"}
 PATH = lbt.LoopHardware(frame_rate_hz=800)
 PHASE = 100 * np.cumsum(np.random.default_rng(0).standard_normal((1500, 2)), axis=0) / 30
+PHASE[:5] = 0  # until pyRTC's loop runs
 
 
 def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
@@ -210,7 +211,7 @@ def test_no_target_writes_one_of_ten_thousand(tmp_path, chunk):
     assert all(written_stable(tmp_path, seeds).values())
 
 
-def test_what_is_no_export_is_refused(tmp_path, designs, slow):
+def test_what_is_no_export_is_refused(tmp_path, designs, slow, sensors_design):
     """Whatever the target, an option of another one, and what makes no matrix or no rehearsal."""
     failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, computed_by="guess")
     certificate = lbt.design.Certificate(checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0))
@@ -234,6 +235,11 @@ def test_what_is_no_export_is_refused(tmp_path, designs, slow):
     rows += [
         (write("k.c", gain_digest=digest), problem, "64 hexadecimal digits")
         for digest in ("AB" * 32, "ab" * 32 + "\n")
+    ]
+    words = "this design reads slow, m1, m2 beside"
+    rows += [
+        (write(target_named(name).path_in(tmp_path), sensors_design, name), problem, words)
+        for name in sorted({*target_names()} - {"c"})
     ]
     rows += [
         (write("k", target=target, **{option: 3}), problem, f"{option} is no option of target")
@@ -322,11 +328,16 @@ def slow():
 def test_each_target_runs_beside_the_design(tmp_path, slow, name):
     """What runs is what is exported."""
     written = lbt.interop.export(target_named(name).path_in(tmp_path), slow, name)
-    noise = np.random.default_rng(1).standard_normal((1500, 2))
+    noise = np.random.default_rng(1).standard_normal((1500, 2)) * (PHASE != 0)
     series = Disturbance(phase_nm=PHASE, noise=noise, sensor_gain=0.8)
     run = rehearse(slow, name, series, hardware=PATH)
-    alone = recorded_run(written.start(np.inf), PATH, PHASE, noise, sensor_gain=0.8)[0]
-    assert np.array_equal(run.target.commands[0], alone[run.settle_frames :, 2:4])
+    programs = written.start(np.inf), ORACLES[name](written.files, PATH, {})
+    alone, program = (
+        recorded_run(one, PATH, PHASE, noise, sensor_gain=0.8)[0, run.settle_frames :, 2:4]
+        for one in programs
+    )
+    assert np.array_equal(run.target.commands[0], alone)
+    assert relative(program, alone) < 1e-12
     assert [check.value for check in run.checks] == [check.value for check in written.checks]
     if name == "cacao":
         steps = json.loads(written.files[1].read_text())["steps"]

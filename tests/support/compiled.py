@@ -42,16 +42,12 @@ def header_numbers(source, name):
 
 
 class Compiled:
-    """One instance of an exported controller: its functions, its own state.
+    """One instance of an exported controller: its functions, its own state."""
 
-    One of several sensors is stepped with what is new and the applied commands, one in estimator
-    form with the applied commands.
-    """
-
-    def __init__(self, source, *, name=None, single=False, library=None):
+    def __init__(self, source, *, name=None, single=False):
         self.name = name or source.stem
         self.real = np.float32 if single else np.float64
-        self.library = build(source) if library is None else library
+        self.library = build(source)
         self.numbers = header_numbers(source, self.name)
         size = self.numbers["STATES"] + self.numbers["COMMANDS"]
         self.masked = "SENSORS" in self.numbers
@@ -75,10 +71,7 @@ class Compiled:
         getattr(self.library, f"{self.name}_phase")(at, ctypes.c_ulong(frames))
 
     def step(self, y, *given):
-        """Take measurements, what is new of them and applied commands; return the commands.
-
-        By default its own commands were applied.
-        """
+        """Take measurements, what is new and applied commands (its own); return the commands."""
         given = given or ([self.u] if self.estimator else [])
         arrays = [np.array(y, dtype=self.real)]
         assert arrays[0].shape == (self.numbers["MEASUREMENTS"],)

@@ -1,9 +1,7 @@
 """Examples of DAREX that have a known solution.
 
-P. Benner, A. J. Laub, V. Mehrmann, "A collection of benchmark examples for the numerical
-solution of algebraic Riccati equations II: discrete-time case", report SPC 95_23, TU
-Chemnitz-Zwickau (1995); numbers of version 2.0 (J. Abels, P. Benner, SLICOT working note
-1999-16), as in SLICOT's BB02AD.
+P. Benner, A. J. Laub, V. Mehrmann, report SPC 95_23, TU Chemnitz-Zwickau (1995), with the numbers
+of version 2.0 (SLICOT working note 1999-16), as in SLICOT's BB02AD.
 """
 
 from typing import NamedTuple

@@ -33,14 +33,8 @@ def bare_problem():
 def sensors_original(*, bounded):
     """A filter of a slow sensor and an accelerometer beside the loop's own sensor."""
     slow = WavefrontSensor(name="slow", rate_hz=400, delay_frames=2, noise_nm=9.0)
-    shaken = Accelerometer(
-        name="mirror",
-        rate_hz=800,
-        delay_frames=1.5,
-        channels=("m1",),
-        noise_m_s2=2e-3,
-        highpass_hz=1.0,
-    )
+    facts = {"channels": ("m1",), "noise_m_s2": 2e-3, "highpass_hz": 1.0}
+    shaken = Accelerometer(name="mirror", rate_hz=800, delay_frames=1.5, **facts)
     own = odd_plant()
     motions = ({"m1": Motion(size=2.0, phase_deg=20.0)},) * len(own.vibrations)
     plant = own.with_sensors(SensorSuite(sensors=(slow, shaken)), motions)

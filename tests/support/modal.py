@@ -55,21 +55,12 @@ def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None
     for i in range(max(map(len, lines.values()), default=0)):
         each = [some[i] if len(some := lines.get(mode, [])) > i else nothing for mode in range(n)]
         frequency_hz = np.array([line.frequency_hz for line in each])
-        moving.append(
-            EnsembleVibration(
-                frequency_hz=frequency_hz,
-                rms_nm=[line.rms_nm for line in each] / np.sinc(frequency_hz * path.dt_s),
-                damping=[line.damping for line in each],
-                direction=(1.0,),
-            )
-        )
-    ensemble = LoopEnsemble(
-        loops=n,
-        turbulence=[air],
-        noise_nm=np.broadcast_to(noise_nm, n)[:, None],
-        vibrations=tuple(moving),
-        **conditions,
-    )
+        facts = {"damping": [line.damping for line in each], "direction": (1.0,)}
+        rms_nm = [line.rms_nm for line in each] / np.sinc(frequency_hz * path.dt_s)
+        moving.append(EnsembleVibration(frequency_hz=frequency_hz, rms_nm=rms_nm, **facts))
+    noise_nm = np.broadcast_to(noise_nm, n)[:, None]
+    facts = {"turbulence": [air], "noise_nm": noise_nm, "vibrations": tuple(moving)}
+    ensemble = LoopEnsemble(loops=n, **facts, **conditions)
     controllers = [lbt.Controller(A=1.0, B=g, C=1.0, D=0.0, dt_s=path.dt_s) for g in gains]
     return ensemble_residuals(textbook_matrices(controllers), path, ensemble).rms_nm
 

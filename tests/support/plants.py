@@ -25,10 +25,9 @@ def lbt_axis_plant(*, modes=1, delay_frames=2.0, damping=0.01):
     return lbt.tip_tilt_plant(frame_rate_hz=800, delay_frames=delay_frames, modes=modes, **models)
 
 
-def random_problem(rng, n, q=1, p=None, l=1):
+def random_problem(rng, n, q=1, l=1):
     """A random problem with correlated noise; A may have a mild unstable mode."""
-    p = n + q if p is None else p
-    A = rng.standard_normal((n, n))
+    A, p = rng.standard_normal((n, n)), n + q
     A *= rng.uniform(0.5, 1.05) / max(abs(np.linalg.eigvals(A)))
     D = rng.standard_normal((q, p))
     B, C, L = (rng.standard_normal(shape) for shape in ((n, p), (q, n), (l, n)))

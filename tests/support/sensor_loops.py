@@ -103,9 +103,8 @@ def sinusoid_reading(hardware, sensor, motion, frequency_hz, signal):
 def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuck=0.0):
     """Return the residual (frames, runs, n) of a loop that starts at rest.
 
-    ``total`` is the phase (frames, runs, n), ``added`` what each reading has beside it: noise, and
-    the acceleration of channels (frames, runs, q). A reading that is not new is a large number.
-    Sensors that are blind read what is stuck (runs, q), or zero.
+    ``added`` is what readings (frames, runs, q) have beside the phase: noise, acceleration. What is
+    not new is a large number; sensors that are blind read what is stuck (runs, q), or zero.
     """
     hardware, suite = plant.hardware, plant.hardware.suite
     taps, frames, runs = hardware.mirror_taps, *total.shape[:2]
@@ -150,8 +149,7 @@ def impulse(frames, runs, size, entries):
 def simulated_covariances(plant, controller, *, frames=300, **loop):
     """Return the residual's covariances (n, n) by origin: turbulence, vibrations, noise.
 
-    White noise leaves the sum of the squares of what an impulse leaves, mean over the phases in
-    which it may come. All impulses run side by side.
+    They are sums of the squares of what impulses leave, mean over the phases where they come.
     """
     hardware, suite, N = plant.hardware, plant.hardware.suite, plant.period
     n, rows = hardware.modes, suite.rows(hardware)

@@ -39,10 +39,9 @@ class Structure:
 
 
 def structure(seed, *, seconds=40.0, modes=(6, 20), channels=(3, 12), gain=0.4):
-    """Draw a structure of modes between 5 and 250 Hz, of damping 0.003 to 0.1, under a few forces.
+    """Draw a structure of modes of 5 to 250 Hz and damping 0.003 to 0.1, under a few forces.
 
-    Each mode moves the two axes and all channels by random factors; an integrator of a delay of
-    two frames ran.
+    Each moves both axes and all channels by random factors; an integrator of two frames ran.
     """
     rng = np.random.default_rng(seed)
     rate = float(rng.choice([500.0, 800.0, 1000.0]))

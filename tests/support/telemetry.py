@@ -76,16 +76,8 @@ def telemetries(draw):
         "diameter_m": st.floats(0.1, 50),
     }
     fields = {k: draw(s) for k, s in optional.items() if draw(st.booleans())}
-    metadata = st.dictionaries(
-        st.text(min_size=1, max_size=20),
-        st.one_of(words, st.booleans(), st.integers(-(2**70), 2**70), finite),
-        max_size=4,
-    )
-    return lbt.files.Telemetry(
-        frame_rate_hz=draw(st.floats(1e-3, 1e6)),
-        commands=series(m),
-        measurements=series(q),
-        total_nm=series(2) if draw(st.booleans()) else None,
-        metadata=draw(metadata),
-        **fields,
-    )
+    fields |= {"total_nm": series(2)} if draw(st.booleans()) else {}
+    values = st.one_of(words, st.booleans(), st.integers(-(2**70), 2**70), finite)
+    metadata = draw(st.dictionaries(st.text(min_size=1, max_size=20), values, max_size=4))
+    series_of = {"commands": series(m), "measurements": series(q), "metadata": metadata}
+    return lbt.files.Telemetry(frame_rate_hz=draw(st.floats(1e-3, 1e6)), **series_of, **fields)
