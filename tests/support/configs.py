@@ -20,7 +20,6 @@ def write_config(tmp_path, content):
 
 
 def with_errors(text, *errors_hz):
-    """The text of a configuration with other errors of the frequency."""
     return re.sub(r"errors_hz: .*", f"errors_hz: {list(errors_hz)}", text)
 
 

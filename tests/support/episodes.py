@@ -67,10 +67,7 @@ class Run:
 
 
 def frames_to_come_back(design, episodes, *, given, seed=0):
-    """Return the frames after each episode until its residual stays at the undisturbed one.
-
-    Inf where it does not within three settling times. ``given`` is the estimator form.
-    """
+    """Return the frames until residuals stay at the undisturbed ones; inf after three settlings."""
     count, rate = len(episodes.gains), design.hardware.frame_rate_hz
     frames = QUIET + LONGEST + 3 * int(np.max(episodes.settling))
     other, free = Run(design, count, given=given), Run(design, count, given=True)

@@ -27,7 +27,6 @@ class BareDesign(lbt.Design):
 
 
 def bare_design(controller):
-    """A design of any controller, without a loop."""
     solver = SolverReport(route="riccati", status="made")
     return BareDesign(method="kalman", problem=controller, solver=solver)
 

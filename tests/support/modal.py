@@ -36,9 +36,8 @@ def some_air(n, order=1, seed=0):
 
 def single_plant(air, mode, lines, noise, gain, **path):
     models = {"turbulence": air.take(mode), "vibrations": lines, "noise_nm": float(noise)}
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, sensor_gain=float(gain), modes=1, **models, **path
-    )
+    path |= {"frame_rate_hz": RATE, "modes": 1}
+    return lbt.tip_tilt_plant(sensor_gain=float(gain), **models, **path)
 
 
 def path_of(**options):

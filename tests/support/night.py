@@ -12,7 +12,6 @@ LINE_HZ, LINE_NM, NOISE, GAIN = 31.0, 60.0, 8.0, 0.7
 
 @cache
 def simulated_night():
-    """The simulation, its hardware and the integrator."""
     path = lbt.LoopHardware(frame_rate_hz=RATE)
     line = lbt.Vibration(frequency_hz=LINE_HZ, damping=0.005, rms_nm=LINE_NM, direction=(1.0, 0.0))
     truth = lbt.Truth(turbulence=slow(), vibrations=(line,), noise_nm=NOISE, sensor_gain=GAIN)

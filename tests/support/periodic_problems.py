@@ -22,7 +22,6 @@ def random_periodic_problem(seed):
 
 
 def relative_distance(own, expected):
-    """Return the norm of a difference over that of what is expected."""
     return np.linalg.norm(np.asarray(own) - expected) / np.linalg.norm(expected)
 
 

@@ -21,8 +21,8 @@ def lbt_axis_plant(*, modes=1, delay_frames=2.0, damping=0.01):
         lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=563.6, direction=direction)
         for direction in np.eye(modes)
     ]
-    models = {"turbulence": turbulence, "vibrations": vibrations, "noise_nm": 15.5}
-    return lbt.tip_tilt_plant(frame_rate_hz=800, delay_frames=delay_frames, modes=modes, **models)
+    models = {"turbulence": turbulence, "vibrations": vibrations, "noise_nm": 15.5, "modes": modes}
+    return lbt.tip_tilt_plant(frame_rate_hz=800, delay_frames=delay_frames, **models)
 
 
 def random_problem(rng, n, q=1, l=1):

@@ -7,13 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.residual import (
-    estimate_residual,
-    gather,
-    mode_noise,
-    replay,
-    settled_test,
-)
+from lbt_synth.identification.prediction import residual
 
 RATE = 800
 CAMERA = lbt.Imaging(diameter_m=8.22)
@@ -60,10 +54,12 @@ def replayed_residual(
 ):
     """Return what a controller would have left of a series on the frames of a test."""
     runs = tuple(stretches or ((0, len(z)),))
-    kept = settled_test(runs, runs if test is None else tuple(test), hardware)
+    kept = residual.settled_test(runs, runs if test is None else tuple(test), hardware)
     noise_nm2 = np.square(noise_nm) * np.eye(hardware.n_measurements)
-    measured = gather(replay(lbt.close_loop(hardware, controller), z, runs), kept)
-    return estimate_residual(measured, kept, *mode_noise(hardware, noise_nm2, noise_error_nm))
+    measured = residual.gather(residual.replay(lbt.close_loop(hardware, controller), z, runs), kept)
+    return residual.estimate_residual(
+        measured, kept, *residual.mode_noise(hardware, noise_nm2, noise_error_nm)
+    )
 
 
 def record_of(z, hardware, *, measured=None):

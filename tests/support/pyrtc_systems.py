@@ -6,6 +6,7 @@ import signal
 from contextlib import contextmanager
 
 import numpy as np
+import pytest
 import yaml
 
 from lbt_synth.loop.disturbances import draw_disturbance
@@ -65,6 +66,7 @@ def synthetic(folder):
 @contextmanager
 def built(folder, conf):
     """Build a system under stream names of its own, and clear it away."""
+    pytest.importorskip("pyrtc")
     import pyshmem
     from pyrtc.manager import RTCManager
 

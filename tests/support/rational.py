@@ -6,7 +6,6 @@ import numpy as np
 
 
 def rational(matrix):
-    """Return a matrix of fractions, exactly."""
     return np.vectorize(Fraction, otypes=[object])(np.asarray(matrix))
 
 

@@ -30,10 +30,7 @@ def csv(path, text=(), **columns):
 
 
 def write_sav(path, **variables):
-    """A save file of IDL with double arrays, numbers and texts, by the description of its format.
-
-    C. B. Markwardt, "Unofficial Format Specification for the IDL SAVE File", 2010.
-    """
+    """A save file of IDL: C. B. Markwardt, "Unofficial Format Specification for the IDL SAVE File"."""
 
     def padded(content):
         return content + b"\0" * (-len(content) % 4)

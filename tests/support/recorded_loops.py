@@ -39,7 +39,6 @@ def integrator_loop(
 
 
 def _integrated(path, truth, *, gain, **options):
-    """Return the simulation of an integrator."""
     return lbt.simulate(lbt.integrator(path, gain=gain).controller, truth, hardware=path, **options)
 
 
@@ -53,19 +52,12 @@ def slow():
 
 
 def identify_series(
-    measurement,
-    correction=None,
-    *,
-    frame_rate_hz=RATE,
-    stretches=None,
-    sensor_gain=None,
-    sensor_gain_error=0.0,
-    start=None,
-    **options,
+    measurement, correction=None, *, stretches=None, start=None, sensor_gain_error=0.0, **options
 ):
     """Identify the series of one axis, at a sensor gain with an error if it is given."""
+    rate_hz, sensor_gain = options.pop("frame_rate_hz", RATE), options.pop("sensor_gain", None)
     pieces = stretches or ((0, len(measurement)),)
-    data = axis_periodogram(measurement, correction, frame_rate_hz, pieces)
+    data = axis_periodogram(measurement, correction, rate_hz, pieces)
     search = Search(data=data, gain=sensor_gain, **options)
     axis = find_axis(search, start=start)
     if not sensor_gain_error:
@@ -97,10 +89,7 @@ def hidden_resonance_record(seed=63):
 
 
 def drifting_record(seed=337, *, gain=0.4062):
-    """Return a loop of sensor gain 0.586 under a drift and frozen flow, of which no model has both.
-
-    The spectrum in closed loop is simpler: coloured noise over a line, at no gain at all.
-    """
+    """Return a loop of gain 0.586 under a drift and frozen flow, which looks simpler at no gain."""
     path = lbt.LoopHardware(frame_rate_hz=723.0, modes=1)
     drift = lbt.models.ARModel(
         coefficients=[0.99988708], driving_rms_nm=3.8718, frame_rate_hz=path.frame_rate_hz
@@ -152,10 +141,7 @@ def spliced_record(seeds=(0,), *, delay=2.0, **options):
 
 
 def open_record(lines=(), *, shared_nm=0.0, noise=6.0, frames=FRAMES, seed=0):
-    """An open loop of two axes whose turbulence has a part in common.
-
-    Lines come with the frames by which tilt follows tip.
-    """
+    """Two axes in open loop with air in common; lines have the frames by which tilt follows tip."""
     rng = np.random.default_rng(seed)
     air, settle = slow(), 4000
 

@@ -23,7 +23,6 @@ simulation: {frames: 2000, cases: 2, settle_frames: 500}
 
 
 def write_config(folder, text=CONFIG):
-    """Write the configuration into a folder."""
     path = folder / "sensors.yaml"
     path.write_text(text)
     return path

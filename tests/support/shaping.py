@@ -21,12 +21,10 @@ def channel(size=12, pole=0.6, delay=2.0):
 
 
 def margin(at_least):
-    """Return the demand of a modulus margin."""
     return lbt.design.shaping.Bound(response="rejection", at_most=1 / at_least)
 
 
 def attenuation(low_hz, high_hz, at_most, sensor_gain=1.0):
-    """Return the demand of a rejection in a band."""
     ends = {"low_hz": low_hz, "high_hz": high_hz, "sensor_gain": sensor_gain}
     return lbt.design.shaping.Bound(response="rejection", at_most=at_most, **ends)
 
@@ -36,7 +34,6 @@ def spec(*demands, terms=(BASIC,)):
 
 
 def shaped(*demands, terms=(BASIC,), path=ONE, functions=20, states=None, **options):
-    """Return the design of a loop for terms and demands."""
     specification = spec(*demands, terms=terms)
     return lbt.design.shape(path, specification, functions=functions, states=states, **options)
 
@@ -47,7 +44,6 @@ def random_coefficients(size, seed=0):
 
 @functools.cache
 def shaped_design():
-    """A shaped design of few states."""
     shaping = lbt.design.shaping
     table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 10, 100], density_nm2_hz=[500, 20, 0.1])
     terms = (

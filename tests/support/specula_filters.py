@@ -64,7 +64,6 @@ def commands(precision, config, files):
 
 
 def simulate_commands(controller, config):
-    """Commands in the loop of a configuration, from the first frame on."""
     loaded = lbt.load_config(config)
     options = {"frames": FRAMES, "seed": SEED, "settle_frames": 0}
     return lbt.simulate(controller, loaded.truth, hardware=loaded.hardware, **options).commands[0]

@@ -30,12 +30,9 @@ class Structure:
         return series
 
     def record(self, start, stop):
-        """Return the record of some frames."""
         series = self.measurements[start:stop], self.commands[start:stop]
-        rate_hz = self.frame_rate_hz
-        return lbt.identification.loop_record(
-            *series, frame_rate_hz=rate_hz, delay_frames=2, unit="nm"
-        )
+        facts = {"frame_rate_hz": self.frame_rate_hz, "delay_frames": 2, "unit": "nm"}
+        return lbt.identification.loop_record(*series, **facts)
 
 
 def structure(seed, *, seconds=40.0, modes=(6, 20), channels=(3, 12), gain=0.4):

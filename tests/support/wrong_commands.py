@@ -24,7 +24,6 @@ FAULTS = {  # measurements and commands of the wrong record, and its repair
 
 
 def record(y, u, delay_frames=2.0):
-    """A record of these series."""
     return lbt.identification.loop_record(
         y, u, frame_rate_hz=RATE, delay_frames=delay_frames, unit="nm"
     )

@@ -94,25 +94,22 @@ def test_the_source_is_what_was_proved(exported, designs, name, form, precision)
 def test_what_is_not_finite_holds_command_and_state(exported, name, form, precision):
     """In arrays of their own, and where commands share one with the measurements."""
     source = exported(name, form, precision).files[0]
-    theirs, clean = (Compiled(source, single=precision == "single") for _ in range(2))
-    before, more = np.zeros(2), form == "estimator"
-    for y in np.random.default_rng(4).standard_normal((20, 2)):
-        for bad in (np.nan, np.inf, -np.inf):
-            state = theirs.state.copy()
-            for place in range(2 + 2 * more):
-                inputs = np.ones(2 + 2 * more)
-                inputs[place] = bad
-                theirs.u[:] = 99.0
-                assert np.array_equal(theirs.step(*inputs.reshape(-1, 2)), before)
-                assert theirs.status == 1
-                assert np.array_equal(theirs.state, state)
-        shared = np.array([np.nan, 1.0], dtype=theirs.real)
-        theirs._call("step", theirs.state, *[shared] * (2 + more))
+    spoilt, clean = (Compiled(source, single=precision == "single") for _ in range(2))
+    rng, before, arrays = np.random.default_rng(4), np.zeros(2), 1 + (form == "estimator")
+    for y in rng.standard_normal((60, 2)):
+        inputs = np.array([y, before][:arrays])
+        bad = inputs.copy()
+        bad.flat[rng.integers(bad.size)] = rng.choice([np.nan, np.inf, -np.inf])
+        spoilt.u[:] = 99.0
+        assert np.array_equal(spoilt.step(*bad), before)
+        assert spoilt.status == 1
+        shared = np.array([np.nan, 1.0], dtype=spoilt.real)
+        spoilt._call("step", spoilt.state, *[shared] * (1 + arrays))
         assert np.array_equal(shared, before)
-        inputs = [y, before][: 1 + more]
         before = clean.step(*inputs)
-        assert np.array_equal(theirs.step(*inputs), before)
-        assert theirs.status == clean.status == 0
+        assert np.array_equal(spoilt.step(*inputs), before)
+        assert np.array_equal(spoilt.state, clean.state)
+        assert spoilt.status == clean.status == 0
 
 
 @st.composite

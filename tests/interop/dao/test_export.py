@@ -17,18 +17,6 @@ from support.refusals import refused, require_refusals
 import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.dao import export as dao
-from lbt_synth.interop.dao.export import (
-    ROUNDING,
-    InnerLoop,
-    _as_computed,
-    _widened,
-    direct_form,
-    direct_form_rows,
-    make_again,
-    mode_loop,
-    mode_polynomials,
-    round_together,
-)
 from lbt_synth.interop.proof import _rounding_left, prove_written
 from lbt_synth.linear.norms import band_norm
 from lbt_synth.loop.disturbances import draw_disturbance
@@ -48,7 +36,7 @@ def test_the_matrix_holds_the_controller(tmp_path, designs, name):
     assert matrix.flags.c_contiguous
     assert not matrix[:, 2:].any()
     assert written.error < 1e-4
-    rows = direct_form_rows(design.controller, 20)
+    rows = dao.direct_form_rows(design.controller, 20)
     assert np.array_equal(matrix[:, :2], rows.astype(np.float32))
 
 
@@ -79,7 +67,7 @@ def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, sh
     drawn = draw_disturbance(truth, shaped.hardware, frames=6000, seed=1)
     exact, single = (
         np.std(recorded_run(run, shaped.hardware, drawn.phase_nm, drawn.noise)[0, 1000:, 0])
-        for run in (shaped.controller.start(), InnerLoop(matrix))
+        for run in (shaped.controller.start(), dao.InnerLoop(matrix))
     )
     assert single == pytest.approx(exact, rel=0.03)
     assert single < 0.3 * np.std(drawn.phase_nm)
@@ -91,11 +79,11 @@ def test_a_sensor_gain_is_in_what_is_made_again(shaped):
     (spec,) = shaped.specifications
     design = lbt.design.shape(half, spec, functions=12, states=None)
     plain, made = (
-        make_again(one, direct_form_rows(one.controller, 20)) for one in (shaped, design)
+        dao.make_again(one, dao.direct_form_rows(one.controller, 20)) for one in (shaped, design)
     )
     # to what the programmes leave open, and what makes up for the rounding of other coefficients
     assert made[:21] == pytest.approx(2 * plain[:21], rel=2e-3, abs=2e-6)
-    assert all(check.passed for check in prove_written(design, _as_computed(design, made)))
+    assert all(check.passed for check in prove_written(design, dao._as_computed(design, made)))
 
 
 @pytest.mark.study
@@ -119,13 +107,13 @@ def test_what_the_matrix_cannot_hold_is_refused(tmp_path, config, designs):
     wide = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0]], C=[[1.0]], D=[[0.0, 0.0]])
     big = lbt.Controller(A=np.eye(2, k=1), B=[[0.0], [1e30]], C=[[1e30, 0.0]], D=[[0.0]])
     with np.errstate(over="ignore"):
-        rows_of_big = direct_form_rows(big, 2).astype(np.float32)
+        rows_of_big = dao.direct_form_rows(big, 2).astype(np.float32)
 
     def write(design, **options):
         return lambda: lbt.interop.export(tmp_path / "k.npy", design, "dao", **options)
 
     def split(controller):
-        return lambda: mode_polynomials(controller)
+        return lambda: dao.mode_polynomials(controller)
 
     coupled = lbt.kalman(slow_plant(modes=2, vibrations=[slanted])).controller
     words = "here measurement 2 moves command 1. Design with --method robust"
@@ -140,7 +128,7 @@ def test_what_the_matrix_cannot_hold_is_refused(tmp_path, config, designs):
     ]
     rows += [
         (
-            lambda beyond=beyond: direct_form(np.array(beyond), 1.0),
+            lambda beyond=beyond: dao.direct_form(np.array(beyond), 1.0),
             NumericalError,
             "beyond its range",
         )
@@ -169,9 +157,9 @@ def test_modes_of_any_order(seed, orders):
         D[mode, mode] = rng.standard_normal() * rng.choice([0, 1])
     turn = rng.permutation(n)
     controller = lbt.Controller(A=A[np.ix_(turn, turn)], B=B[turn], C=C[:, turn], D=D)
-    rows = direct_form_rows(controller, 6)
+    rows = dao.direct_form_rows(controller, 6)
     series = rng.standard_normal((100, m))
-    runs = controller.start(), DifferenceEquation(rows), direct_form(rows, 1.0).start()
+    runs = controller.start(), DifferenceEquation(rows), dao.direct_form(rows, 1.0).start()
     expected, *others = ([run.step(y) for y in series] for run in runs)
     assert np.allclose(
         others, [expected] * 2, rtol=0, atol=1e-9 * max(1.0, np.max(np.abs(expected)))
@@ -183,7 +171,7 @@ def test_coefficients_of_close_poles():
     r, n = 1 - 2.0**-10, 8
     A = r * np.eye(n) + np.eye(n, k=1)
     C, B = np.eye(n)[:1], np.eye(n)[:, -1:]
-    ((num, den),) = mode_polynomials(lbt.Controller(A=A, B=B, C=C, D=[[0.0]]))
+    ((num, den),) = dao.mode_polynomials(lbt.Controller(A=A, B=B, C=C, D=[[0.0]]))
     exact = [comb(n, k) * (-1) ** k * 1023**k / 1024**k for k in range(n + 1)]
     assert den == pytest.approx(exact, abs=BALANCE * max(exact))
     assert num == pytest.approx([0.0] * (n - 1) + [1.0, 0.0], abs=BALANCE * max(exact))
@@ -194,7 +182,7 @@ def test_it_gives_the_commands_bit_for_bit(limit):
     rng = np.random.default_rng(1)
     matrix = (0.2 * rng.standard_normal((9, 3))).astype(np.float32)
     series = rng.standard_normal((200, 3)).astype(np.float32)
-    loop, equation = InnerLoop(matrix, limit=limit), DifferenceEquation(matrix, limit)
+    loop, equation = dao.InnerLoop(matrix, limit=limit), DifferenceEquation(matrix, limit)
     found, expected = (np.array([run.step(y) for y in series]) for run in (loop, equation))
     assert np.array_equal(found, expected)
     assert np.any(np.abs(expected) > 0.9) != np.isfinite(limit)
@@ -204,8 +192,8 @@ def test_it_gives_the_commands_bit_for_bit(limit):
 
 @pytest.fixture(scope="module")
 def case(shaped):
-    rows = direct_form_rows(shaped.controller, 20)[:, 0]
-    return mode_loop(shaped.hardware, shaped.specifications[0], 20), rows
+    rows = dao.direct_form_rows(shaped.controller, 20)[:, 0]
+    return dao.mode_loop(shaped.hardware, shaped.specifications[0], 20), rows
 
 
 def rounding_nm(loop, c):
@@ -241,38 +229,30 @@ def test_sums_are_as_large_as_in_a_simulation(case):
         last, u = u, equation.step(residual + noise)
         residual = phase - last
         squares += np.sum(equation.terms**2) + np.sum(np.cumsum(equation.terms)[1:] ** 2)
-    expected = ROUNDING * squares / frames
+    expected = dao.ROUNDING * squares / frames
     assert loop.sums_nm2(c, loop.gains[0]) == pytest.approx(expected, rel=0.15)
 
 
-def test_rounding_in_the_loop_is_that_of_the_lyapunov_equation(case, shaped):
-    """Noise that enters with the command, through the state-space loop.
-
-    A factor common to both polynomials keeps the state-space loop well conditioned.
-    """
-    loop, own = case
-    c = _widened(own)
-    added = np.concatenate([np.eye(21)[0], c[21:]])
-    written, entry = (direct_form(x[:, None], shaped.controller.dt_s) for x in (c, added))
-    variance = np.array([loop.sums_nm2(c, 1.0)])
-    left = _rounding_left(shaped.hardware, written, entry, variance, 1.0)
-    assert rounding_nm(loop, c)[0] == pytest.approx(np.sqrt(left[0]), rel=2e-3)
-
-
-def test_a_common_factor_leaves_the_loop_as_it_is(case):
-    """Sections give back the coefficients."""
+def test_a_common_factor_leaves_the_loop_and_takes_rounding_away(case, shaped):
+    """It keeps the state-space loop, through which noise enters with the command, well conditioned."""
     loop, c = case
-    wide = _widened(c)
+    wide = dao._widened(c)
     assert loop.residuals_nm(wide) == pytest.approx(loop.residuals_nm(c), rel=1e-6)
-    assert rounding_nm(loop, wide)[0] < 0.2 * rounding_nm(loop, c)[0]
     assert dao._coefficients(dao._sections(wide)) == pytest.approx(wide, abs=1e-9)
+    before, after = rounding_nm(loop, c)[0], rounding_nm(loop, wide)[0]
+    assert after < 0.2 * before
+    added = np.concatenate([np.eye(21)[0], wide[21:]])
+    written, entry = (dao.direct_form(x[:, None], shaped.controller.dt_s) for x in (wide, added))
+    variance = np.array([loop.sums_nm2(wide, 1.0)])
+    rounding_nm2 = _rounding_left(shaped.hardware, written, entry, variance, 1.0)
+    assert after == pytest.approx(np.sqrt(rounding_nm2[0]), rel=2e-3)
 
 
 def test_slopes_are_those_of_finite_differences(case):
     """Without the rounding, whose memory counts as constant."""
     loop, c = case
     loop = replace(loop, shares=np.zeros_like(loop.shares))
-    theta = dao._sections(_widened(c))
+    theta = dao._sections(dao._widened(c))
     shares = 1 / loop.residuals_nm(c)
     limits = dao._limits(loop, c)
     before, slopes = dao._rows(loop, shares, limits, theta)
@@ -291,11 +271,11 @@ def test_slopes_are_those_of_finite_differences(case):
 def test_errors_of_rounding_cancel_where_they_count(case):
     """Against rounding one by one, by what each changes of the loop's polynomial."""
     loop, own = case
-    c = _widened(own)
-    rounded = round_together(loop, c)
+    c = dao._widened(own)
+    rounded = dao.round_together(loop, c)
     assert rounded.dtype == np.float32
     assert np.any(own == 0)
-    assert np.all(round_together(loop, own)[own == 0] == 0)
+    assert np.all(dao.round_together(loop, own)[own == 0] == 0)
 
     def change(near):
         gains = (1.0, loop.low, loop.high, *loop.gains)

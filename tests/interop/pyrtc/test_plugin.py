@@ -4,17 +4,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support import pyrtc_systems as systems
 from support.exports import lbt_config, lbt_designs, relative
 from support.gain_files import odd_plant
-from support.pyrtc_systems import (
-    SENSOR_HZ,
-    drawn,
-    modal_residuals,
-    pol_series,
-    residual_rms,
-    running,
-    synthetic,
-)
 from support.recorded_runs import recorded_run
 from support.refusals import require_refusals
 
@@ -29,7 +21,8 @@ SETTLE = 500
 
 @cache
 def given():
-    return drawn(lbt_config().truth, lbt_config().hardware, frames=2000, seed=2, quiet=QUIET)
+    config = lbt_config()
+    return systems.drawn(config.truth, config.hardware, frames=2000, seed=2, quiet=QUIET)
 
 
 def export(folder, name="kalman", **options):
@@ -51,9 +44,8 @@ def test_only_the_loop_is_lent():
 @pytest.mark.parametrize(("name", "own_process"), [("odd", False), ("hinf", True)])
 def test_commands_are_those_of_the_controller(tmp_path, name, own_process):
     """To the last bit those of the twin, and to single precision ours."""
-    pytest.importorskip("pyrtc")
     design = export(tmp_path, name)
-    with running(tmp_path, own_process=own_process) as (telescope, _):
+    with systems.running(tmp_path, own_process=own_process) as (telescope, _):
         found = commands(telescope, design.hardware)
     assert np.array_equal(found, commands(InnerLoop(pol_filter(design)), design.hardware))
     own = commands(design.controller.start(), design.hardware)
@@ -73,36 +65,34 @@ def test_pyrtc_finds_nothing_to_say_about_the_configuration(tmp_path):
 
 @pytest.mark.e2e
 def test_the_residual_is_below_those_of_its_own_predictors(tmp_path):
-    pytest.importorskip("pyrtc")
     config, left = lbt_config(), {}
     design = export(tmp_path)
-    training = pol_series(config.truth, config.hardware, frames=8000, seed=1)
+    training = systems.pol_series(config.truth, config.hardware, frames=8000, seed=1)
     others = {kind: {"type": kind, "delay_frames": 2} for kind in ("ar_kalman", "least_squares")}
     for kind, predictor in {"ours": None, **others}.items():
-        fitted_to = None if kind == "ours" else training
-        with running(tmp_path, predictor=predictor, training=fitted_to) as (telescope, loop):
+        options = {"predictor": predictor, "training": None if kind == "ours" else training}
+        with systems.running(tmp_path, **options) as (telescope, loop):
             found = commands(telescope, design.hardware)
             assert loop.predictor_fitted == (kind != "ours")
-        left[kind] = residual_rms(found[:, SETTLE:])
+        left[kind] = systems.residual_rms(found[:, SETTLE:])
     assert left["ours"] < min(left["ar_kalman"], left["least_squares"])
 
 
 @pytest.mark.e2e
 def test_it_closes_on_the_sensor_of_pyrtc(tmp_path):
     """Its images, its slopes and its calibration, at its own pace."""
-    pytest.importorskip("pyrtc")
-    path = lbt.LoopHardware(frame_rate_hz=SENSOR_HZ, delay_frames=1)
+    path = lbt.LoopHardware(frame_rate_hz=systems.SENSOR_HZ, delay_frames=1)
     lbt.interop.export(tmp_path, lbt.integrator(path, gain=0.4), "pyrtc", modes=6)
     config = tmp_path / "config.yaml"
     config.write_text(config.read_text().replace("other_gain: 0.0", "other_gain: 0.5"))
 
     def left():
         """Part of each mode that the closed loop leaves: about 0.2, if no frame is late."""
-        with synthetic(tmp_path) as manager:
-            open_loop = np.std(modal_residuals(manager, 120), axis=0)
+        with systems.synthetic(tmp_path) as manager:
+            open_loop = np.std(systems.modal_residuals(manager, 120), axis=0)
             manager.start_component("loop")
-            modal_residuals(manager, 50)  # until it has settled
-            return np.std(modal_residuals(manager, 120), axis=0) / open_loop
+            systems.modal_residuals(manager, 50)  # until it has settled
+            return np.std(systems.modal_residuals(manager, 120), axis=0) / open_loop
 
     assert any(np.all(left() < 0.6) for _ in range(3))  # a busy machine may try again
 
@@ -111,9 +101,8 @@ def test_it_closes_on_the_sensor_of_pyrtc(tmp_path):
 def test_a_spoilt_frame_repeats_the_command_and_a_loop_that_stops_is_an_error(
     tmp_path, monkeypatch
 ):
-    pytest.importorskip("pyrtc")
     export(tmp_path)
-    with running(tmp_path) as (telescope, loop):
+    with systems.running(tmp_path) as (telescope, loop):
         for k in range(10):
             last = telescope.step([float(k), 1.0])
         assert np.any(last)
