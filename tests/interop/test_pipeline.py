@@ -4,6 +4,8 @@ import hashlib
 import json
 import math
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -103,16 +105,6 @@ def decays(hardware, program):
     return False
 
 
-class Running:
-    """A program that steps files, just started."""
-
-    def __init__(self, step):
-        self.step = step
-
-    def reset(self):
-        pass
-
-
 def run_matlab(files, *_):
     """Step ``ss(A, B, C, D)`` as MATLAB does."""
     form = loadmat(files[0])["textbook"][0, 0]
@@ -124,7 +116,7 @@ def run_matlab(files, *_):
         state[:] = A @ state + B @ y
         return u
 
-    return Running(step)
+    return SimpleNamespace(step=step, reset=lambda: None)
 
 
 def run_pyrtc(files, hardware, _):
@@ -140,7 +132,7 @@ def run_pyrtc(files, hardware, _):
         sent[:] = [*sent[1:], (-predictor.predict()).astype(np.float32)]
         return -sent[-1].astype(float)
 
-    return Running(step)
+    return SimpleNamespace(step=step, reset=lambda: None)
 
 
 ORACLES = {
@@ -159,9 +151,8 @@ PHASE[:5] = 0  # until pyRTC's loop runs
 def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
     """Files of an integrator, judged in the loop of one that is too slow for it."""
     assert list(ORACLES) == list(target_names())
-    quick, late = (
-        lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=delay) for delay in (2, 3)
-    )
+    quick = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    late = replace(quick, delay_frames=3)
     design = lbt.integrator(quick, gain=0.9)
     for name, oracle in ORACLES.items():
         target = target_named(name)
@@ -212,6 +203,7 @@ def test_what_is_no_export_is_refused(tmp_path, designs, slow, sensors_design):
     failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, computed_by="guess")
     certificate = lbt.design.Certificate(checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0))
     bad = replace(slow, certificate=certificate)
+    bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
 
     def write(file, design=slow, target=None, **options):
         target = target or FILES.get(file, "dao")
@@ -232,10 +224,12 @@ def test_what_is_no_export_is_refused(tmp_path, designs, slow, sensors_design):
         (write("k.c", gain_digest=digest), problem, "64 hexadecimal digits")
         for digest in ("AB" * 32, "ab" * 32 + "\n")
     ]
-    words = "this design reads slow, m1, m2 beside"
+    others = sorted({*target_names()} - {"c"})
+    kinds = [(sensors_design, "this design reads slow, m1, m2 beside", name) for name in others]
+    kinds += [(bare, "needs the design of a loop", name) for name in ("cacao", "dao", "pyrtc")]
     rows += [
-        (write(target_named(name).path_in(tmp_path), sensors_design, name), problem, words)
-        for name in sorted({*target_names()} - {"c"})
+        (write(target_named(name).path_in(tmp_path), design, name), problem, words)
+        for design, words, name in kinds
     ]
     rows += [
         (write("k", target=target, **{option: 3}), problem, f"{option} is no option of target")
@@ -243,13 +237,13 @@ def test_what_is_no_export_is_refused(tmp_path, designs, slow, sensors_design):
     ]
     mixed = MixedController(filter=slow, gains=GAINS)
     wild = MixedController(filter=designs["kalman"], gains=[0.0, 0.0, 1.5])
-    bare = MixedController(filter=designs["kalman"].controller, gains=[0.0, 0.0, 0.5])
+    unsure = MixedController(filter=designs["kalman"].controller, gains=[0.0, 0.0, 0.5])
     alone, any_error = MixedController(gains=[0.5]), lbt.errors.LbtSynthError
     rows += [
         (write("k", target="fpga"), problem, "target must be one of c, cacao"),
         (write("k.npy", MixedController(gains=[0.5, 0.3])), any_error, "got NoneType"),
         (write("k.npy", wild), any_error, "gain|stable"),
-        (write("k.npy", bare), any_error, "must be a certified design"),
+        (write("k.npy", unsure), any_error, "must be a certified design"),
         (write("k.npy", other_gain=0.3), any_error, "other_gain needs modes, the number"),
         (write("k.npy", other_gain=-0.3, modes=3), any_error, "above 0"),
         (write("k.npy", alone, other_gain=0.3), any_error, "other_gain goes with a design"),
@@ -373,16 +367,14 @@ def test_what_cannot_be_rehearsed_is_refused(tmp_path, slow, monkeypatch):
     wrong = lbt.Controller(A=eye, B=-0.4 * eye, C=eye, D=0 * eye, dt_s=PATH.dt_s)
     broken = replace(lbt.interop.export(tmp_path / "k.c", slow, "c"), start=lambda _: wrong.start())
 
-    def run(*arguments):
-        return lambda: rehearse(*arguments, hardware=PATH)
-
+    run, errors = partial(rehearse, hardware=PATH), lbt.errors
     monkeypatch.setattr("lbt_synth.interop.pipeline.export", lambda *_: broken)
     words = "of c the loop grows beyond all numbers"
     require_refusals(
         [
-            (run(slow, "dao", strong), lbt.errors.UnstableLoopError, None),
-            (run(several, "c", series), lbt.errors.ProblemError, "got one of several sensors"),
-            (run(slow, "c", long), lbt.errors.NumericalError, words),
+            (partial(run, slow, "dao", strong), errors.UnstableLoopError, None),
+            (partial(run, several, "c", series), errors.ProblemError, "got one of several sensors"),
+            (partial(run, slow, "c", long), errors.NumericalError, words),
         ]
     )
 

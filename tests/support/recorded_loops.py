@@ -68,8 +68,7 @@ def identify_series(
 def resonant_record(seed=0):
     """Return a loop of sensor gain 0.9 under frozen flow, two wide resonances and a line."""
     resonances = ((60.0, 0.1, 60.0, 20.0), (110.0, 0.08, 30.0, 120.0), (31.0, 0.004, 40.0, 70.0))
-    air = _air(1.057, 39.57, 12.0)
-    truth = {"turbulence": air, "noise_nm": 5.0, "sensor_gain": 0.9}
+    truth = {"turbulence": _air(1.057, 39.57, 12.0), "noise_nm": 5.0, "sensor_gain": 0.9}
     return _directed_record(500.0, 0.4, resonances, seed, **truth)
 
 
@@ -83,8 +82,7 @@ def hidden_resonance_record(seed=63):
         (20.17, 0.1502, 12.2, 173.3),
         (139.78, 0.1958, 84.1, 169.4),
     )
-    air = _air(1.381, 23.6, 23.1)
-    truth = {"turbulence": air, "noise_nm": 2.82, "sensor_gain": 0.995}
+    truth = {"turbulence": _air(1.381, 23.6, 23.1), "noise_nm": 2.82, "sensor_gain": 0.995}
     return _directed_record(1000.0, 0.2266, resonances, seed, **truth)
 
 

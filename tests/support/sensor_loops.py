@@ -15,14 +15,8 @@ LINES = (
     lbt.Vibration(frequency_hz=95, damping=0.08, rms_nm=100, direction=(1, 1)),
 )
 MOTIONS = ({"m1": Motion(size=2.0), "m2": Motion(size=0.5, phase_deg=150)}, {"m2": Motion(size=1)})
-FAST = Accelerometer(
-    name="mirror",
-    rate_hz=RATE_HZ,
-    delay_frames=2,
-    channels=("m1", "m2"),
-    noise_m_s2=[[4e-6, 1e-6], [1e-6, 9e-6]],
-    highpass_hz=3.0,
-)
+CHANNELS = {"channels": ("m1", "m2"), "noise_m_s2": [[4e-6, 1e-6], [1e-6, 9e-6]]}
+FAST = Accelerometer(name="mirror", rate_hz=RATE_HZ, delay_frames=2, highpass_hz=3.0, **CHANNELS)
 SLOW = WavefrontSensor(
     name="truth",
     rate_hz=RATE_HZ / 4,

@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -180,12 +180,10 @@ EVIL = '*/ int main(void) {} /* x\\\n*/ ??/ *\n/ #error \u202e*/ a"b \x00'
 @pytest.mark.usefixtures("short_rehearsal")
 def test_words_cannot_leave_the_comment(tmp_path, designs):
     check = lbt.design.Check(name=EVIL, value=0.0, limit=1.0, computed_by=EVIL)
-    design = replace(
-        designs["integrator"],
-        method=EVIL,
-        solver=SolverReport(route=EVIL, status=EVIL),
-        certificate=replace(designs["integrator"].certificate, checks=(check,)),
-    )
+    solver = SolverReport(route=EVIL, status=EVIL)
+    certificate = replace(designs["integrator"].certificate, checks=(check,))
+    facts = {"method": EVIL, "solver": solver, "certificate": certificate}
+    design = replace(designs["integrator"], **facts)
     source = lbt.interop.export(tmp_path / "tip-tilt.v2.c", design, "c", name="Tip_tilt2").files[0]
     Compiled(source, name="Tip_tilt2")
     code = source.read_text()
@@ -248,14 +246,10 @@ HELD = 2  # of a predictor
 @pytest.fixture(scope="module")
 def sensor_files(sensors_design, tmp_path_factory):
     folder = tmp_path_factory.mktemp("masked_c")
+    write = partial(lbt.interop.export, design=sensors_design, target="c")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "FRAMES", 500)
-        return {
-            precision: lbt.interop.export(
-                folder / f"{precision}.c", sensors_design, "c", precision=precision
-            )
-            for precision in LIMITS
-        }
+        return {kind: write(folder / f"{kind}.c", precision=kind) for kind in LIMITS}
 
 
 def require_commands(design, truth, drops, written, limit, *, single=False):

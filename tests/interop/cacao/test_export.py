@@ -205,7 +205,6 @@ def test_what_the_filter_cannot_hold_is_refused(tmp_path):
     problem, failed = lbt.errors.ProblemError, lbt.errors.NumericalError
     slow, late = lbt.integrator(PATH, gain=0.1), replace(PATH, delay_frames=9.0)
     blind = lbt.integrator(replace(PATH, sensor_matrix=np.array([[0.3]])), gain=0.5)
-    bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
     stroke = lbt.design.shaping.CommandRms(at_most_nm=1e4, turbulence=AIR, noise_nm=15.0)
     held = shaped(stroke, terms=[VARIANCE], path=PATH, functions=8)
     many, few = make_design(line(1e-5, 3.0)), make_design(line(1e-4, 3.0))
@@ -218,7 +217,6 @@ def test_what_the_filter_cannot_hold_is_refused(tmp_path):
             (write(slow, steps=1), problem, "steps must be at least 2"),
             (write(lbt.integrator(late, gain=0.02)), problem, "delay of at most 8"),
             (write(blind), problem, words),
-            (write(bare), problem, "needs the design of a loop"),
             (write(held), problem, "got command stroke of at most .* such as c"),
         ]
     )

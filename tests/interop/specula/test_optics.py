@@ -1,6 +1,7 @@
 """Modes, slopes and images of SPECULA's optics."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -53,19 +54,14 @@ def test_too_many_modes_for_the_mirror():
 
 
 def test_systems_that_are_refused(setup):
-    three, twice = ({"modes": 3}, {"sensor_matrix": 2 * np.eye(2)})
-    changes = [({"diameter_m": 0}, "diameter_m")]
-    changes += [({"pixels": pixels}, "pixels must be even") for pixels in (61, 20, 2000)]
-    changes += [
-        ({"hardware": lbt.LoopHardware(frame_rate_hz=800, **path)}, words)
-        for path, words in ((three, "two modes"), (twice, "sensor_matrix"))
-    ]
-    require_refusals(
-        [
-            (lambda change=change: replace(setup, **change), ProblemError, words)
-            for change, words in changes
-        ]
+    three, twice = (
+        lbt.LoopHardware(frame_rate_hz=800, **path)
+        for path in ({"modes": 3}, {"sensor_matrix": 2 * np.eye(2)})
     )
+    changes = [({"pixels": pixels}, "pixels must be even") for pixels in (61, 20, 2000)]
+    changes += [({"diameter_m": 0}, "diameter_m")]
+    changes += [({"hardware": three}, "two modes"), ({"hardware": twice}, "sensor_matrix")]
+    require_refusals([(partial(replace, setup, **c), ProblemError, words) for c, words in changes])
 
 
 def test_a_phase_screen_is_longer_than_the_way_of_the_wind(setup):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -62,16 +63,10 @@ def test_the_same_seed_is_the_same_run_and_the_same_air(calibration):
     [(np.zeros(3), r"must have shape \(2,\)"), (np.full(2, np.nan), "finite")],
 )
 def test_a_controller_that_returns_something_else(calibration, returned, match):
-    class Odd:
-        def step(self, y):
-            return returned
-
-        def reset(self):
-            pass
-
+    odd = SimpleNamespace(step=lambda _: returned, reset=lambda: None)
     short = replace(SETUP, frames=2, settle_frames=200)
     with pytest.raises(ProblemError, match=match):
-        run_end_to_end(short, Odd(), calibration=calibration)
+        run_end_to_end(short, odd, calibration=calibration)
 
 
 def test_leaks_and_gains_of_the_mixed_controller(setup):
@@ -118,6 +113,7 @@ MIRROR = Accelerometer(
     name="mirror", rate_hz=800, delay_frames=1.3, channels=("m1", "m2"), noise_m_s2=5e-4
 )
 TRUTH_SENSOR = WavefrontSensor(name="truth", rate_hz=200, delay_frames=2, noise_nm=5.0)
+SHAKEN = lbt.Truth(turbulence=None, vibrations=SHAKES, motions=MOTIONS)
 SETTINGS = replace(DIM, vibrations=SHAKES, motions=MOTIONS, leak_from_mode=2, leak=0.99, **LENGTH)
 
 
@@ -146,21 +142,16 @@ def shaking():
 
 def test_channels_follow_the_motions_that_shake_the_telescope():
     quiet = dim_filter(replace(MIRROR, noise_m_s2=1e-7))
-    shaken = lbt.Truth(turbulence=None, vibrations=SHAKES, motions=MOTIONS)
     own = accompany_filter(quiet, SETTINGS)
-    rng = np.random.default_rng(2)
-    phase, _ = draw_phase(
-        shaken, PATH, frames=2000, cases=1, rng=rng, zero_frame=400, frame_means=True
-    )
-    tilts = phase[0]
+    options = {"frames": 2000, "cases": 1, "zero_frame": 400, "frame_means": True}
+    phase, _ = draw_phase(SHAKEN, PATH, rng=np.random.default_rng(2), **options)
+    tilts, reading = phase[0], partial(sinusoid_reading, PATH, MIRROR)
     # the second line alone has a part along tilt
     second = tilts[:, 1] / 0.8
     moved = {0: tilts[:, 0] - 0.6 * second, 1: second}
     for column, channel in enumerate(("m1", "m2")):
         expected = sum(
-            sinusoid_reading(
-                PATH, MIRROR, MOTIONS[line][channel], SHAKES[line].frequency_hz, motion
-            )
+            reading(MOTIONS[line][channel], SHAKES[line].frequency_hz, motion)
             for line, motion in moved.items()
             if channel in MOTIONS[line]
         )
@@ -188,16 +179,21 @@ def test_controllers_that_do_not_fit_are_refused(setup, shaking):
     late = dim_filter(replace(MIRROR, delay_frames=2), delay_frames=2.5)
     single, still = dim_filter(TRUTH_SENSOR, modes=1), replace(SETTINGS, motions=({}, {}))
 
-    def mix(*arguments):
-        return lambda: mix_controller(*arguments)
-
     rows = [
-        (lambda: run_end_to_end(setup, object()), ProblemError, "step"),
-        (mix(setup, other), ProblemError, r"1000 Hz and 2 frames"),
-        (mix(setup, slow), ProblemError, "another mirror"),
-        (mix(still, shaking), ProblemError, r"moves a channel of the design \(m1, m2\)"),
-        (mix(SETTINGS, single), DimensionError, "two measurements .* got 1 to 1"),
-        (mix(SETTINGS, late), ProblemError, "800 Hz and 2.5 frames"),
+        (partial(run_end_to_end, setup, object()), ProblemError, "step"),
+        (partial(mix_controller, setup, other), ProblemError, r"1000 Hz and 2 frames"),
+        (partial(mix_controller, setup, slow), ProblemError, "another mirror"),
+        (
+            partial(mix_controller, still, shaking),
+            ProblemError,
+            r"moves a channel of the design \(m1, m2\)",
+        ),
+        (
+            partial(mix_controller, SETTINGS, single),
+            DimensionError,
+            "two measurements .* got 1 to 1",
+        ),
+        (partial(mix_controller, SETTINGS, late), ProblemError, "800 Hz and 2.5 frames"),
     ]
     require_refusals(rows)
 
@@ -206,18 +202,11 @@ def test_controllers_that_do_not_fit_are_refused(setup, shaking):
 def test_with_accelerometers_a_dim_star_leaves_less_as_predicted(shaking, calibration):
     """All sensors against the wavefront only, each as the exact analysis says of the pyramid's noise."""
     found, expected = {}, {}
-    for name, design in (
-        ("all", shaking),
-        ("alone", lbt.kalman(shaking.problem.own_sensor_alone())),
-    ):
+    alone = lbt.kalman(shaking.problem.own_sensor_alone())
+    for name, design in {"all": shaking, "alone": alone}.items():
         run = run_end_to_end(SETTINGS, design, calibration=calibration)
-        truth = lbt.Truth(
-            turbulence=None,
-            vibrations=SHAKES,
-            motions=MOTIONS,
-            noise_nm=run.summary()["tip_tilt_noise_nm"],
-            sensor_gain=run.tip_tilt_gain,
-        )
+        noise_nm = run.summary()["tip_tilt_noise_nm"]
+        truth = replace(SHAKEN, noise_nm=noise_nm, sensor_gain=run.tip_tilt_gain)
         loop = design.close(PATH, sensor_gain=run.tip_tilt_gain)
         found[name] = np.hypot(*run.rms_nm[:2])
         expected[name] = lbt.residual_budget(loop, truth, frame_means=True).rms_nm
