@@ -34,13 +34,6 @@ def build(source):
     return ctypes.CDLL(str(target))
 
 
-def header_numbers(source, name):
-    """Return the whole numbers that a header defines, by name without the prefix."""
-    header = source.with_suffix(".h").read_text()
-    numbers = re.findall(rf"{name.upper()}_(\w+) (?:= )?(\d+)\b", header)
-    return {key: int(value) for key, value in numbers}
-
-
 class Compiled:
     """One instance of an exported controller: its functions, its own state."""
 
@@ -48,10 +41,12 @@ class Compiled:
         self.name = name or source.stem
         self.real = np.float32 if single else np.float64
         self.library = build(source)
-        self.numbers = header_numbers(source, self.name)
+        header = source.with_suffix(".h").read_text()
+        numbers = re.findall(rf"{self.name.upper()}_(\w+) (?:= )?(\d+)\b", header)
+        self.numbers = {key: int(value) for key, value in numbers}
         size = self.numbers["STATES"] + self.numbers["COMMANDS"]
         self.masked = "SENSORS" in self.numbers
-        self.estimator = "*applied" in source.with_suffix(".h").read_text()
+        self.estimator = "*applied" in header
         if self.masked:  # a flag and a phase
             size += 8 // self.real().nbytes
         self.state = np.full(size, 7.0, dtype=self.real)  # what was in the memory before

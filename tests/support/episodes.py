@@ -1,5 +1,7 @@
 """Loops whose commands are clipped, not applied or held for a while, many at once."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,11 +28,15 @@ class Episodes:
 
     @classmethod
     def draw(cls, design, count, rng, gains):
-        gains = np.sort(rng.uniform(*gains, count))
-        radii = affine_radii(parts_by_gain(design.hardware, design.controller), gains)
-        kinds, ends = rng.integers(len(KINDS), size=count), rng.integers(1, LONGEST, size=count)
-        depth = rng.uniform(0, 0.7, size=count)
-        return cls(gains, kinds, QUIET + ends, depth, np.array([*map(settling_frames, radii)]))
+        found = np.sort(rng.uniform(*gains, count))
+        radii = affine_radii(parts_by_gain(design.hardware, design.controller), found)
+        return cls(
+            gains=found,
+            kinds=rng.integers(len(KINDS), size=count),
+            ends=QUIET + rng.integers(1, LONGEST, size=count),
+            depth=rng.uniform(0, 0.7, size=count),
+            settling=np.array([settling_frames(radius) for radius in radii]),
+        )
 
 
 def disturbances(count, frames, rng, rate):
@@ -67,15 +73,17 @@ class Run:
 
 
 def frames_to_come_back(design, episodes, *, given, seed=0):
-    """Return the frames until residuals stay at the undisturbed ones; inf after three settlings."""
+    """Return the frames after each episode until its residual stays at the undisturbed one.
+
+    Inf where it does not within three settling times. ``given`` is the estimator form.
+    """
     count, rate = len(episodes.gains), design.hardware.frame_rate_hz
     frames = QUIET + LONGEST + 3 * int(np.max(episodes.settling))
     other, free = Run(design, count, given=given), Run(design, count, given=True)
-    largest, power, away = np.zeros((count, 1)), np.zeros(count), np.zeros(count)
-    kind, series = (
-        episodes.kinds[:, None],
-        disturbances(count, frames, np.random.default_rng(seed), rate),
-    )
+    largest, power = np.zeros((count, 1)), np.zeros(count)
+    away = np.zeros(count)
+    kind = episodes.kinds[:, None]
+    series = disturbances(count, frames, np.random.default_rng(seed), rate)
     with np.errstate(all="ignore"):  # the plain form may grow beyond all numbers
         for k, (total, noise) in enumerate(series):
             limit = 1.2 * np.maximum(largest, 3 * (TURBULENCE_NM + LINE_NM))

@@ -1,15 +1,13 @@
 """Turbulence and vibrations of many modes."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.loop.budget import ensemble_residuals
-from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
-from lbt_synth.loop.evaluator import textbook_matrices
 
 RATE = 800.0
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
@@ -45,23 +43,21 @@ def path_of(**options):
     return lbt.LoopHardware(**({"frame_rate_hz": RATE} | options))
 
 
-def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None, **conditions):
+def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None, sensor_gain=1.0):
     """Return what an integrator for each mode leaves in the image, (n,), nan if unstable."""
-    path, n = (hardware or path_of()).single_mode(), len(gains)
-    lines = {mode: np.atleast_1d(some).tolist() for mode, some in (vibrations or {}).items()}
-    nothing = lbt.Vibration(frequency_hz=20, damping=0.5, rms_nm=1e-9)
-    moving = []
-    for i in range(max(map(len, lines.values()), default=0)):
-        each = [some[i] if len(some := lines.get(mode, [])) > i else nothing for mode in range(n)]
-        frequency_hz = np.array([line.frequency_hz for line in each])
-        facts = {"damping": [line.damping for line in each], "direction": (1.0,)}
-        rms_nm = [line.rms_nm for line in each] / np.sinc(frequency_hz * path.dt_s)
-        moving.append(EnsembleVibration(frequency_hz=frequency_hz, rms_nm=rms_nm, **facts))
-    noise_nm = np.broadcast_to(noise_nm, n)[:, None]
-    facts = {"turbulence": [air], "noise_nm": noise_nm, "vibrations": tuple(moving)}
-    ensemble = LoopEnsemble(loops=n, **facts, **conditions)
-    controllers = [lbt.Controller(A=1.0, B=g, C=1.0, D=0.0, dt_s=path.dt_s) for g in gains]
-    return ensemble_residuals(textbook_matrices(controllers), path, ensemble).rms_nm
+    path, residuals = (hardware or path_of()).single_mode(), []
+    conditions = (np.broadcast_to(values, len(gains)) for values in (noise_nm, sensor_gain))
+    for mode, (gain, noise, sensor) in enumerate(zip(gains, *conditions, strict=True)):
+        law = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=path.dt_s)
+        lines = [
+            replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz * path.dt_s))
+            for line in np.atleast_1d((vibrations or {}).get(mode, []))
+        ]
+        facts = {"vibrations": lines, "noise_nm": float(noise), "sensor_gain": float(sensor)}
+        loop = lbt.close_loop(path, law, sensor_gain=float(sensor))
+        truth = lbt.Truth(turbulence=air.take(mode), **facts)
+        residuals.append(lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else np.nan)
+    return np.array(residuals)
 
 
 def joint_controller(parts, n):

@@ -2,8 +2,7 @@
 
 from functools import cache
 
-from support.recorded_loops import RATE, slow
-from support.records import record
+from support.recorded_loops import RATE, record_of, slow
 
 import lbt_synth as lbt
 
@@ -22,4 +21,4 @@ def simulated_night():
 def night_record():
     """The record of the simulated night, as telemetry would hold it."""
     run, path, _ = simulated_night()
-    return record(run, path)
+    return record_of(run, path)

@@ -1,11 +1,14 @@
 """Exact rational arithmetic on matrices of floating-point numbers, which are rational."""
 
+from __future__ import annotations
+
 from fractions import Fraction
 
 import numpy as np
 
 
-def rational(matrix):
+def rational(matrix) -> np.ndarray:
+    """Return a matrix of fractions, exactly."""
     return np.vectorize(Fraction, otypes=[object])(np.asarray(matrix))
 
 

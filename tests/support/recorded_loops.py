@@ -2,7 +2,6 @@
 
 import numpy as np
 from scipy.signal import lfilter
-from support.records import record
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.fitting import Search
@@ -16,15 +15,7 @@ LINE = ((31.0, 0.004, 60.0),)  # frequency [Hz], damping ratio, rms [nm]
 
 
 def integrator_loop(
-    *,
-    lines=(),
-    noise=6.0,
-    sensor_gain=0.6,
-    gain=0.4,
-    frames=FRAMES,
-    seed=0,
-    turbulence=None,
-    axes=1,
+    *, lines=(), noise=6.0, sensor_gain=0.6, gain=0.4, frames=FRAMES, seed=0, axes=1, **air
 ):
     """Measurements and corrections of an integrator's loop, (frames, axes) each."""
     vibrations = [
@@ -32,7 +23,7 @@ def integrator_loop(
         for f, z, r in lines
     ]
     facts = {"vibrations": vibrations, "noise_nm": noise, "sensor_gain": sensor_gain}
-    truth = lbt.Truth(turbulence=slow() if turbulence is None else turbulence, **facts)
+    truth = lbt.Truth(**{"turbulence": slow(), **facts, **air})
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=axes)
     run = _integrated(path, truth, gain=gain, frames=frames, seed=seed, frame_means=True)
     return run.measurements[0][2:], run.commands[0][:-2]
@@ -40,6 +31,12 @@ def integrator_loop(
 
 def _integrated(path, truth, *, gain, **options):
     return lbt.simulate(lbt.integrator(path, gain=gain).controller, truth, hardware=path, **options)
+
+
+def record_of(run, path):
+    """Return the record of a simulation."""
+    facts = {"frame_rate_hz": path.frame_rate_hz, "delay_frames": path.delay_frames}
+    return lbt.identification.loop_record(run.measurements[0], run.commands[0], unit="nm", **facts)
 
 
 def slow():
@@ -96,7 +93,7 @@ def drifting_record(seed=337, *, gain=0.4062):
     total = lbt.models.SumSpectrum(parts=[_air(1.3785, 15.56, 12.702), drift])
     truth = lbt.Truth(turbulence=total, vibrations=(line,), noise_nm=3.403, sensor_gain=0.5859)
     options = {"frames": int(15 * path.frame_rate_hz), "seed": seed, "settle_frames": 2000}
-    return record(_integrated(path, truth, gain=gain, **options), path)
+    return record_of(_integrated(path, truth, gain=gain, **options), path)
 
 
 def _air(seeing_arcsec, outer_scale_m, wind_speed_m_s):
@@ -114,7 +111,7 @@ def _directed_record(rate_hz, gain, resonances, seed, **truth):
     ]
     options = {"frames": int(30 * rate_hz), "seed": seed, "settle_frames": 500, "frame_means": True}
     run = _integrated(path, lbt.Truth(vibrations=lines, **truth), gain=gain, **options)
-    return record(run, path)
+    return record_of(run, path)
 
 
 def expected_periodogram(air, noise, gain, seconds=30):

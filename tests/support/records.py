@@ -22,9 +22,15 @@ def ran(path, *, noise_nm=0.0, sensor_gain=1.0, frames=300, seed=3, gain=0.1):
 
 
 def record(run, path, **more):
-    facts = {"frame_rate_hz": path.frame_rate_hz, "delay_frames": path.delay_frames}
-    series = run.measurements[0], run.commands[0]
-    return lbt.identification.loop_record(*series, mirror=path.mirror, unit="nm", **facts, **more)
+    return lbt.identification.loop_record(
+        run.measurements[0],
+        run.commands[0],
+        frame_rate_hz=path.frame_rate_hz,
+        delay_frames=path.delay_frames,
+        mirror=path.mirror,
+        unit="nm",
+        **more,
+    )
 
 
 def kinds(seen):
@@ -37,4 +43,7 @@ def noise(frames, seed=0):
 
 def findings(record):
     """What was found in a record: kind, series, axis, frames, the first of them."""
-    return [(f.kind, f.series, f.axis, f.count, f.first_frame) for f in record.findings]
+    return [
+        (each.kind, each.series, each.axis, each.count, each.first_frame)
+        for each in record.findings
+    ]

@@ -1,5 +1,9 @@
 """A small loop of several sensors: a dim star, a slow quiet sensor and two accelerometers."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
 CONFIG = """\
 version: 1
 telescope: {diameter_m: 8.22, obstruction: 0.11}
@@ -22,7 +26,8 @@ simulation: {frames: 2000, cases: 2, settle_frames: 500}
 """
 
 
-def write_config(folder, text=CONFIG):
+def write_config(folder: Path, text: str = CONFIG) -> Path:
+    """Write the configuration into a folder."""
     path = folder / "sensors.yaml"
     path.write_text(text)
     return path

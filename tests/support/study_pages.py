@@ -27,8 +27,13 @@ def results(n=300, seed=0):
     stable = {name: np.ones(n) for name in strehls}
     stable["sharp"][gain < 0.5] = 0
     stable["frail"][::50] = np.nan
-    values = (gain, delay, wind, np.full(n, 0.9))
-    columns = {"row": np.arange(n), **dict(zip(PARAMETERS, values, strict=True))}
+    columns = {
+        "row": np.arange(n),
+        "truth.sensor_gain": gain,
+        "error.delay_frames": delay,
+        "atmosphere.wind_speed_m_s": wind,
+        "fixed": np.full(n, 0.9),
+    }
     for name, strehl in strehls.items():
         there = stable[name] == 1
         columns[f"{name}.stable"] = stable[name]
@@ -43,6 +48,7 @@ FAILURES = [(row, "frail", f"<b>no</b> design in row {row}") for row in range(0,
 
 @cache
 def night():
+    """A study of 300 samples, read from night.yaml."""
     study = lbt.studies.load_study(ROOT / "examples" / "study.yaml")
     settings = study.settings.model_copy(update={"samples": 300})
     return replace(study, settings=settings, source=Path("night.yaml"))

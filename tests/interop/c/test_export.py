@@ -327,20 +327,17 @@ def test_a_slip_of_the_phase_is_seen_and_mended(sensor_files):
     assert compiled.status == 0
 
 
-@pytest.mark.parametrize(
-    ("names", "identifiers"),
-    [
+def test_names_of_sensors_that_are_no_identifiers(sensors_design):
+    terms = source_terms(sensors_design)
+    for names, identifiers in (
         (("slow one", "2nd", "m*/"), ["WAVEFRONT", "SLOW_ONE", "2ND", "M"]),
         (("m-1", "m_1", "ä"), ["WAVEFRONT_0", "M_1_1", "M_1_2", "3"]),
         (("x" * 30, "int", "\\\n*/"), ["WAVEFRONT_0", "X" * 24 + "_1", "INT_2", "3"]),
-    ],
-)
-def test_names_of_sensors_that_are_no_identifiers(sensors_design, names, identifiers):
-    terms = source_terms(sensors_design)
-    rows = dict(zip(("wavefront", *names), terms.rows.values(), strict=True))
-    units = c_export._describe_units(replace(terms, rows=rows))
-    assert [unit["identifier"] for unit in units] == identifiers
-    assert all(unit["name"].isascii() and "*/" not in unit["name"] for unit in units)
+    ):
+        rows = dict(zip(("wavefront", *names), terms.rows.values(), strict=True))
+        units = c_export._describe_units(replace(terms, rows=rows))
+        assert [unit["identifier"] for unit in units] == identifiers
+        assert all(unit["name"].isascii() and "*/" not in unit["name"] for unit in units)
 
 
 def test_the_certificate_and_the_cost_are_those_of_the_source(sensor_files, sensors_design):

@@ -44,12 +44,10 @@ def test_the_matrix_holds_the_controller(tmp_path, designs, name):
 
 def written_radius(matrix, low, high):
     """Largest spectral radius of the loop of two frames, from the polynomial of the numbers."""
-    order, largest = len(matrix) // 2, 0.0
-    for gain in np.geomspace(low, high, 400):
-        polynomial = np.concatenate([[1.0], -matrix[order + 1 :, 0].astype(float), [0.0, 0.0]])
-        polynomial[2:] += gain * matrix[: order + 1, 0]
-        largest = max(largest, np.max(np.abs(np.roots(polynomial))))
-    return largest
+    b, a = np.split(matrix[:, 0].astype(float), [len(matrix) // 2 + 1])
+    gains = np.geomspace(low, high, 400)
+    polynomials = [np.r_[1.0, -a, 0.0, 0.0] + np.r_[0.0, 0.0, gain * b] for gain in gains]
+    return max(np.max(np.abs(np.roots(polynomial))) for polynomial in polynomials)
 
 
 def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, shaped):
