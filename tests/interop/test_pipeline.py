@@ -86,10 +86,7 @@ def taps(hardware):
 
 
 def decays(hardware, program):
-    """Whether a loop in any arithmetic comes back from a kick.
-
-    A slow line may still swing up when the first frames are over.
-    """
+    """Whether a loop in any arithmetic comes back from a kick; slow lines may swing up at first."""
     past, residual = [np.zeros(hardware.modes)] * len(taps(hardware)), np.full(hardware.modes, 100)
     sizes = []
     for frames in (FRAMES, 16 * FRAMES):
@@ -163,10 +160,7 @@ def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
 
 
 def written_stable(folder, seeds):
-    """Require that no file of random gain files is unstable; return how many were written.
-
-    A design that cannot be made has no file, nor has one that a target refuses.
-    """
+    """Require that no file of random gain files is unstable; return how many each target took."""
     written = dict.fromkeys(ORACLES, 0)
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -210,16 +204,14 @@ def test_what_is_no_export_is_refused(tmp_path, designs, slow, sensors_design):
         return lambda: lbt.interop.export(tmp_path / file, design, target, **options)
 
     problem, output = lbt.errors.ProblemError, lbt.errors.OutputError
-    rows = [
-        row
-        for file in FILES
-        for row in (
+    rows = []
+    for file, target in FILES.items():
+        rows += [
             (write(file, 3), problem, "expected a Design; got int"),
             (write(file, bad), lbt.errors.CertificateError, "this one failed: rms"),
-            (write(f"nowhere/{file}", target=FILES[file]), output, "cannot write"),
-            (write(f"{file}x", target=FILES[file]), output, "must end in"),
-        )
-    ]
+            (write(f"nowhere/{file}", target=target), output, "cannot write"),
+            (write(f"{file}x", target=target), output, "must end in"),
+        ]
     rows += [
         (write("k.c", gain_digest=digest), problem, "64 hexadecimal digits")
         for digest in ("AB" * 32, "ab" * 32 + "\n")

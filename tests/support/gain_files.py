@@ -16,13 +16,9 @@ from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 @functools.cache
 def odd_plant():
     """A plant whose sensor, mirror, noise and delay are not the simplest."""
-    return slow_plant(
-        2.5,
-        modes=2,
-        noise_nm=[15.5, 20.0],
-        sensor_matrix=[[1.1, 0.1], [-0.1, 0.9]],
-        influence_matrix=[[0.9, 0.0], [0.1, 1.2]],
-    )
+    matrices = {"sensor_matrix": [[1.1, 0.1], [-0.1, 0.9]]}
+    matrices["influence_matrix"] = [[0.9, 0.0], [0.1, 1.2]]
+    return slow_plant(2.5, modes=2, noise_nm=[15.5, 20.0], **matrices)
 
 
 def bare_problem():

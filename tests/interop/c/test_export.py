@@ -253,10 +253,7 @@ def sensor_files(sensors_design, tmp_path_factory):
 
 
 def require_commands(design, truth, drops, written, limit, *, single=False):
-    """Require the commands of a simulation, on its readings and applied commands; return the source.
-
-    Sensors are missing alone and together; the twin has the same bits.
-    """
+    """Require the commands of a simulation, and the twin's bits; return the source that ran."""
     path, options = design.hardware, {"frames": 1200, "settle_frames": 0, "drops": drops}
     run, rows = lbt.simulate(design, truth, hardware=path, **options), path.suite.rows(path)
     readings = [place.stop - place.start for place in rows.values()]
@@ -288,10 +285,7 @@ def test_the_commands_are_those_of_the_simulation(sensors_design, sensors_config
 
 @pytest.mark.parametrize("precision", LIMITS)
 def test_what_cannot_be_used_is_missing(sensor_files, precision):
-    """Bit for bit, with what is new, not due, not finite and not applied drawn at random.
-
-    The slow sensor is missing from a frame in which it is due until it is read again.
-    """
+    """Bit for bit, at random; the slow sensor is missing from when it is due until it is read."""
     written, rng = sensor_files[precision], np.random.default_rng(0)
     compiled = Compiled(written.files[0], single=precision == "single")
     twin, missing, seen = written.start(np.inf), np.zeros(4, dtype=bool), set()

@@ -29,10 +29,8 @@ def test_single_precision_is_that_of_the_source(terms):
 
 def test_the_proof_is_of_the_loop_around_the_terms(sensors_design, terms):
     """Stable alone, too: what is left of the state where neither readings nor commands come."""
-    checks = {
-        check.name: check
-        for check in prove_written(sensors_design, as_computed(sensors_design, terms))
-    }
+    proof = prove_written(sensors_design, as_computed(sensors_design, terms))
+    checks = {check.name: check for check in proof}
     assert len(checks) == 5
     assert all(check.passed for check in checks.values())
     loop = lbt.close_loop(sensors_design.hardware, sensors_design)

@@ -23,10 +23,8 @@ PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
 
 
 def make_design(*vibrations, modes=1):
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=AIR, noise_nm=15.0, modes=modes, vibrations=vibrations
-    )
-    return lbt.kalman(plant)
+    models = {"turbulence": AIR, "noise_nm": 15.0, "vibrations": vibrations, "modes": modes}
+    return lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=800, **models))
 
 
 def line(damping, rms_nm):

@@ -54,13 +54,10 @@ def test_too_many_modes_for_the_mirror():
 
 
 def test_systems_that_are_refused(setup):
-    three, twice = (
-        lbt.LoopHardware(frame_rate_hz=800, **path)
-        for path in ({"modes": 3}, {"sensor_matrix": 2 * np.eye(2)})
-    )
+    path = partial(lbt.LoopHardware, frame_rate_hz=800)
     changes = [({"pixels": pixels}, "pixels must be even") for pixels in (61, 20, 2000)]
-    changes += [({"diameter_m": 0}, "diameter_m")]
-    changes += [({"hardware": three}, "two modes"), ({"hardware": twice}, "sensor_matrix")]
+    changes += [({"diameter_m": 0}, "diameter_m"), ({"hardware": path(modes=3)}, "two modes")]
+    changes += [({"hardware": path(sensor_matrix=2 * np.eye(2))}, "sensor_matrix")]
     require_refusals([(partial(replace, setup, **c), ProblemError, words) for c, words in changes])
 
 
