@@ -1,5 +1,8 @@
 """Records of designs: each claim and each array counts, and what is altered is refused."""
 
+from functools import reduce
+from operator import getitem
+
 import numpy as np
 import pytest
 from support.gain_files import ORIGINALS, edited_file, original
@@ -14,10 +17,7 @@ FACTOR = 1.001
 
 def set_meta(*keys, value):
     def change(document):
-        place = document["meta"]
-        for key in keys[:-1]:
-            place = place[key]
-        place[keys[-1]] = value
+        reduce(getitem, keys[:-1], document["meta"])[keys[-1]] = value
 
     return change
 
@@ -63,13 +63,14 @@ def test_each_claim_and_each_array_counts(name):
     """Times 1.001, a named check fails, or the file contradicts itself."""
     design = original(name)
     record = record_design(design)
+    arrays, meta, claims = record.arrays, record.meta, record.meta["claims"]
     assert complaint(design, record) == ""
-    for key, array in record.arrays.items():
+    for key, array in arrays.items():
         if np.any(array):
-            changed = DesignRecord({**record.arrays, key: FACTOR * array}, record.meta)
+            changed = DesignRecord({**arrays, key: FACTOR * array}, meta)
             assert complaint(design, changed), key
-    assert record.meta["claims"]
-    for key, value in record.meta["claims"].items():
+    assert claims
+    for key, value in claims.items():
         more = [FACTOR * part for part in value] if isinstance(value, list) else FACTOR * value
-        meta = {**record.meta, "claims": {**record.meta["claims"], key: more}}
-        assert complaint(design, DesignRecord(record.arrays, meta)), key
+        changed = DesignRecord(arrays, {**meta, "claims": {**claims, key: more}})
+        assert complaint(design, changed), key
