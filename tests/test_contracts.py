@@ -19,7 +19,7 @@ FORBIDDEN = {
         "h5py",
         "Only storage.array_file imports h5py",
     ),
-    "studies/study/new_pool.py": ("distributed", "Only studies.grid imports distributed"),
+    "studies/study/new_pool.py": ("distributed", "Only storage.executors imports distributed"),
     "report/page/new_chart.py": ("bokeh", "Only report.explore imports bokeh"),
     "report/page/new_sheet.py": ("weasyprint", "Only report.page.html imports weasyprint"),
     "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),

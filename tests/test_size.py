@@ -14,19 +14,19 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3169,
+    "cli": 3175,
     "config": 1622,
     "design": 5984,
     "files": 1252,
-    "identification": 8844,
+    "identification": 8860,
     "interop": 3687,
-    "linear": 4748,
-    "loop": 3945,
+    "linear": 4749,
+    "loop": 3953,
     "methods": 784,
     "models": 3749,
-    "report": 3263,
-    "storage": 1060,
-    "studies": 3190,
+    "report": 3269,
+    "storage": 1126,
+    "studies": 3200,
     "errors, validation": 554,
 }
 COUNTS = {
@@ -35,7 +35,7 @@ COUNTS = {
     "tuned constants": 498,
     "lines of tests": 28254,
     "lines of benchmarks": 3998,
-    "words of docs": 62412,
+    "words of docs": 62512,
 }
 
 

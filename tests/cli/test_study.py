@@ -16,7 +16,7 @@ from support.studies import TWO, assert_whole, evaluate_quickly, part_rows, read
 
 import lbt_synth as lbt
 from lbt_synth.errors import NumericalError
-from lbt_synth.studies.grid import connect_cluster
+from lbt_synth.storage.executors import connect_cluster
 from lbt_synth.studies.study.run import evaluate_samples
 
 
@@ -168,7 +168,7 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
 @pytest.mark.e2e
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""])
 def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
-    monkeypatch.setattr("lbt_synth.studies.grid._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.storage.executors._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     before = time.monotonic()
     status, _, error = run(capsys, "study", path, "-o", tmp_path / "out", "--dask", address)
@@ -182,7 +182,7 @@ def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
 def test_a_scheduler_without_workers(tmp_path, capsys, monkeypatch):
     from distributed import LocalCluster
 
-    monkeypatch.setattr("lbt_synth.studies.grid._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.storage.executors._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
         status, _, error = run(
