@@ -22,7 +22,6 @@ PROOF = "infeasible level over the level proved, less 1"
 
 @cache
 def designed(sensors, **changes):
-    """Return a plant, the gains of its least variance, and its fall-backs."""
     plant = example_plant(sensors, **changes)
     return plant, kalman_riccati(plant).gain_predictor, make_fallbacks(plant)
 
@@ -105,10 +104,9 @@ def test_claims_of_an_hinf_filter_that_are_wrong(hinf):
     assert failed(hinf, witness=None) == {PROOF}
     gain = lbt.kalman(hinf.problem).gain_predictor
     norms = (
-        "estimation error, rms, against the one",
-        "estimation error, H-infinity norm, against the one",
+        f"estimation error, {name}, against the one claimed" for name in ("rms", "H-infinity norm")
     )
-    assert failed(hinf, gain_predictor=gain) == {BOUND, *(f"{name} claimed" for name in norms)}
+    assert failed(hinf, gain_predictor=gain) == {BOUND, *norms}
 
 
 def test_the_loop_of_one_rate_is_that_of_the_filter():

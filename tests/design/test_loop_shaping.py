@@ -9,14 +9,7 @@ from support.robust_config import EXAMPLE
 from support.shaping import BASIC, NOISE, ONE, RATE, SLOW, attenuation, margin, shaped, spec
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping import (
-    Bound,
-    CommandRms,
-    LoopErrors,
-    ResidualVariance,
-    Specification,
-    VibrationBand,
-)
+from lbt_synth.design.shaping import Bound, CommandRms, LoopErrors, ResidualVariance, VibrationBand
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
@@ -146,7 +139,10 @@ def test_what_makes_no_sense_is_refused():
         (lambda: CommandRms(**command, rate="x"), "rate must be True or False"),
         (lambda: spec(3), "demands must be of Bound, CommandRms, LoopErrors; got int"),
         (lambda: spec(peak, peak), "given once; got twice 'modulus margin"),
-        (lambda: Specification(terms=[BASIC], demands=peak), "demands must be a list"),
+        (
+            lambda: lbt.design.shaping.Specification(terms=[BASIC], demands=peak),
+            "demands must be a list",
+        ),
         (lambda: shape(3, spec()), "such as plant.hardware, must be a LoopHardware; got int"),
         (lambda: shape(ONE, 3), "expected a Specification"),
         (lambda: shape(ONE, [spec(), spec()]), "one for each of 1 modes; got 2"),

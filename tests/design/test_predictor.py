@@ -9,12 +9,8 @@ import pytest
 from support.predictors import BASE, HEARING, PATH, coefficients, made, readings
 
 import lbt_synth as lbt
-from lbt_synth.design.predictor import (
-    command_rms,
-    predictor_design,
-    reduce_filter,
-    regression_filter,
-)
+from lbt_synth.design import predictor
+from lbt_synth.design.predictor import reduce_filter, regression_filter
 from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.loop.closed_loop import youla_controller
 
@@ -73,7 +69,7 @@ def test_noise_of_readings_is_that_of_a_run() -> None:
     whites = (rng.standard_normal((20_000, 1)) * np.eye(5)[reading] for reading in range(5))
     commands = np.array([stepped(design.parameters[0], white) for white in whites])
     drawn = np.sqrt(np.sum(np.var(commands, axis=1), axis=1))
-    assert command_rms(design.parameters)[:5] == pytest.approx(drawn, rel=0.03)
+    assert predictor.command_rms(design.parameters)[:5] == pytest.approx(drawn, rel=0.03)
     (table,) = design.tables()
     assert [row.reading for row in table.rows] == ["wavefront 1", "wavefront 2", "a", "b", "c"]
 
@@ -117,4 +113,4 @@ def test_a_predictor_needs_a_record() -> None:
     with pytest.raises(ProblemError, match="the method predictor is made of a record"):
         lbt.load_config("examples/lbt.yaml").design("predictor")
     with pytest.raises(ProblemError, match="one filter, and a fall-back"):
-        predictor_design(HEARING, [BASE], readings(), 1.0, what="test")
+        predictor.predictor_design(HEARING, [BASE], readings(), 1.0, what="test")

@@ -15,35 +15,28 @@ from lbt_synth.files.gain_file.store import require_agreement
 FACTOR = 1.001
 
 
-def set_meta(*keys, value):
-    def change(document):
-        reduce(getitem, keys[:-1], document["meta"])[keys[-1]] = value
-
-    return change
-
-
-def read_too_early(document):
-    document["arrays"]["GAIN_PREDICTOR"][1][0][2] = 1e-3  # the slow sensor is not due at phase 1
-
-
 @pytest.mark.parametrize(
-    "change",
+    ("path", "value"),
     [
-        set_meta("sensors", 0, "noise_nm", value=10.0),
-        set_meta("sensors", 0, "delay_frames", value=3.0),
-        set_meta("sensors", 1, "highpass_hz", value=2.0),
-        set_meta("sensors", 1, "kind", value="thermometer"),
-        set_meta("motions", 0, "m1", "size", value=1.9),
-        set_meta("motions", 0, value={}),
-        set_meta("fallbacks", 0, value=["m1"]),
-        set_meta("vibrations", 0, "frequency_hz", value=21.0),
-        set_meta("frame_rate_hz", value=999.0),
-        set_meta("method", value="integrator"),
-        read_too_early,
+        (("sensors", 0, "noise_nm"), 10.0),
+        (("sensors", 0, "delay_frames"), 3.0),
+        (("sensors", 1, "highpass_hz"), 2.0),
+        (("sensors", 1, "kind"), "thermometer"),
+        (("motions", 0, "m1", "size"), 1.9),
+        (("motions", 0), {}),
+        (("fallbacks", 0), ["m1"]),
+        (("vibrations", 0, "frequency_hz"), 21.0),
+        (("frame_rate_hz",), 999.0),
+        (("method",), "integrator"),
+        (("GAIN_PREDICTOR", 1, 0, 2), 1e-3),  # the slow sensor is not due at phase 1
     ],
 )
-def test_an_altered_file_is_refused(sensors_design, tmp_path, change):
-    words = "GAIN_PREDICTOR is not what" if change is read_too_early else None
+def test_an_altered_file_is_refused(sensors_design, tmp_path, path, value):
+    def change(document):
+        reduce(getitem, path[:-1], document["arrays"] | document["meta"])[path[-1]] = value
+        document["meta"] |= {path[0]: value} if len(path) == 1 else {}
+
+    words = "GAIN_PREDICTOR is not what" if path[0] == "GAIN_PREDICTOR" else None
     with pytest.raises(GainFileError, match=words):
         lbt.load_gain(edited_file(tmp_path / "sensors.npz", sensors_design, change))
 

@@ -8,6 +8,7 @@ from scipy.integrate import trapezoid
 from scipy.linalg import expm
 from support import predictions, sensor_loops
 from support.ensembles import AIR
+from support.limits import Anonymous
 from support.plants import lbt_axis_plant
 from support.refusals import require_refusals
 from support.sensor_loops import FAST, MOTIONS, RATE_HZ, SLOW, example_plant
@@ -115,6 +116,7 @@ def channels(name, period, delay_frames, names=("m1", "m2"), **filtered):
     return Accelerometer(name=name, channels=names, **facts, **filtered)
 
 
+ONE_LINE = {"lines": sensor_loops.LINES[:1], "motions": MOTIONS[:1]}
 SELDOM = WavefrontSensor(name="seldom", rate_hz=50, delay_frames=1.3, noise_nm=4)
 SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=500)
 AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, frame_rate_hz=RATE_HZ)
@@ -130,26 +132,22 @@ def test_a_measured_spectrum_against_brute_force():
     rng = np.random.default_rng(0)
     f = np.linspace(5, 100, 3393)
     lines = sum(40 / (1 + ((f - c) / w) ** 2) for c, w in ((10, 0.1), (48.3, 0.03), (72.5, 0.05)))
-    table = lbt.models.TabulatedSpectrum(
-        frequency_hz=f, density_nm2_hz=lines * rng.uniform(0.2, 1, f.size)
-    )
+    density = lines * rng.uniform(0.2, 1, f.size)
+    table = lbt.models.TabulatedSpectrum(frequency_hz=f, density_nm2_hz=density)
     plant = lbt_axis_plant()
     loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
     # a triangle of unit area leaves the rejection at its place
-    narrow = lbt.models.TabulatedSpectrum(
-        frequency_hz=[37.297, 37.3, 37.303], density_nm2_hz=[0, 100 / 0.003, 0]
-    )
+    ends, density = [37.297, 37.3, 37.303], [0, 100 / 0.003, 0]
+    narrow = lbt.models.TabulatedSpectrum(frequency_hz=ends, density_nm2_hz=density)
     left = abs(loop.sensitivity([37.3])[0, 0, 0]) * np.sinc(37.3 / 800)
     line = lbt.residual_budget(loop, Truth(turbulence=narrow))
     assert line.turbulence_nm == pytest.approx(10 * left, rel=1e-3)
     fine = np.linspace(5, 100, 3392 * 20 + 1)
-    power = np.abs(loop.sensitivity(fine)[:, 0, 0]) ** 2
-    share = np.sinc(fine / 800) ** 2
+    power, share = np.abs(loop.sensitivity(fine)[:, 0, 0]) ** 2, np.sinc(fine / 800) ** 2
     budget = lbt.residual_budget(loop, Truth(turbulence=table))
-    expected = trapezoid(table.psd(fine) * power * share, fine)
-    assert budget.turbulence_nm**2 == pytest.approx(expected, rel=1e-5)
-    expected = trapezoid(table.psd(fine) * (1 - share), fine)
-    assert budget.within_nm**2 == pytest.approx(expected, rel=1e-5)
+    powers = budget.turbulence_nm**2, budget.within_nm**2
+    expected = [trapezoid(table.psd(fine) * x, fine) for x in (power * share, 1 - share)]
+    assert powers == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), predictions.CASES)
@@ -178,10 +176,8 @@ def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
         lbt.Vibration(frequency_hz=0.2, damping=1e-3, rms_nm=1000, direction=(1,)),
         lbt.Vibration(frequency_hz=0.1, damping=0.05, rms_nm=300, direction=(1,)),
     ]
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=4000, turbulence=air, noise_nm=0.03, vibrations=lines, modes=1
-    )
-    truth = Truth(turbulence=air, vibrations=lines, noise_nm=0.03)
+    facts = {"turbulence": air, "vibrations": lines, "noise_nm": 0.03}
+    plant, truth = lbt.tip_tilt_plant(frame_rate_hz=4000, modes=1, **facts), Truth(**facts)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant))
     for frame_means, apart in ((True, 1e-9), (False, 1e-6)):
         found = lbt.residual_budget(loop, truth, frame_means=frame_means)
@@ -205,14 +201,7 @@ def closed(plant, **facts):
         ({"delay_frames": 1.5, "turbulence": AR3}, {}),
         ({"delay_frames": 3, "sensors": (channels("half", 2, 1.625, ("m2",)), SLOW)}, {}),
         ({"sensors": (channels("sleepy", 3, 2.875),)}, {}),  # exposures wait, and end in a frame
-        (
-            {
-                "sensors": (channels("third", 3, 1), SELDOM),
-                "lines": sensor_loops.LINES[:1],
-                "motions": MOTIONS[:1],
-            },
-            {},
-        ),
+        (ONE_LINE | {"sensors": (channels("third", 3, 1), SELDOM)}, {}),
         ({"mirror": SHELL, "influence_matrix": [[2.0, 0.1], [0.3, 1.0]]}, {}),
         ({"sensor_matrix": [[1, 0], [0, 1], [0.5, 0.5]], "noise_nm": [30, 30, 40]}, {}),
     ],
@@ -221,9 +210,8 @@ def test_budgets_are_what_impulses_leave(changes, loop):
     plant = example_plant(**changes)
     controller, own = closed(plant, **loop)
     budget = residual_budget(own, plant, frame_means=True)
-    if not loop and changes.keys().isdisjoint(
-        ("mirror", "turbulence")
-    ):  # the residual of the model is the error of the filter
+    # the residual of the model is the error of the filter
+    if not loop and changes.keys().isdisjoint(("mirror", "turbulence")):
         P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
         rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
         assert budget.rms_nm == pytest.approx(rms, rel=1e-9)
@@ -327,26 +315,16 @@ def test_a_line_that_channels_hardly_see_is_one_that_they_do_not(changes):
 PATH = lbt.LoopHardware(frame_rate_hz=800)
 LAZY = lbt.integrator(PATH, gain=0.3).controller
 LOOP, SENSORS = lbt.close_loop(PATH, LAZY), example_plant()
-WILD = lbt.close_loop(
-    PATH,
-    lbt.Controller(A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800),
-)
+WILD = lbt.close_loop(PATH, replace(LAZY, B=10 * LAZY.B))
 OTHER_RATE = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
 DRIFTING = lbt.models.SinusoidalVibration(frequency_hz=20, end_hz=30, duration_s=1, rms_nm=100)
 
 
-class Odd:
-    """A density that is none."""
-
-    def psd(self, frequency_hz):
-        return np.full(np.shape(frequency_hz), -1.0)
-
-
-ODD, FEW = Truth(turbulence=Odd(), noise_nm=1.0), closed(example_plant((FAST,)))[0]
+ODD = Truth(turbulence=Anonymous(lambda f: np.full(np.shape(f), -1.0)), noise_nm=1.0)
+FEW = closed(example_plant((FAST,)))[0]
 
 
 def met(*lines, turbulence=None, loop=LOOP, **facts):
-    """Ask for the residual of a loop."""
     return lbt.residual_budget(loop, Truth(turbulence=turbulence, vibrations=lines, **facts))
 
 
@@ -364,7 +342,7 @@ def test_refusals():
         (lambda: met(sinusoid(600, 1)), ProblemError, "below the Nyquist"),
         (lambda: met(turbulence=OTHER_RATE), ProblemError, "sampled at the loop's 800 Hz"),
         (lambda: met(DRIFTING), ProblemError, "stationary"),
-        (lambda: met(turbulence=Odd()), ProblemError, "one finite number of at least 0"),
+        (lambda: lbt.residual_budget(LOOP, ODD), ProblemError, "one finite number of at least 0"),
         (lambda: lbt.loop.least_residual(PATH, ODD), ProblemError, "finite number of at least 0"),
         (lambda: met(loop=WILD), UnstableLoopError, "an unstable one"),
         (lambda: met(loop=strong[1], sensor_gain=8.0), UnstableLoopError, "at sensor gain 8"),

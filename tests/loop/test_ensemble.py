@@ -32,7 +32,6 @@ PLANTS = {
 
 @cache
 def designed(name):
-    """Return the Kalman filter of a plant by its name."""
     return lbt.kalman(plant(**PLANTS[name]))
 
 
@@ -54,7 +53,6 @@ def ensemble_of(w, turbulence):
 
 
 def truth_of(w, i, turbulence):
-    """Return what one of these loops meets."""
     one = {name: float(numbers[i]) for name, numbers in w.items()}
     f, facts = one["frequency"], {"rms_nm": one["rms"], "direction": (1, 0.5)}
     lines = (

@@ -1,6 +1,7 @@
 """Simulated loops against the loop equations and the exact residual."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -56,20 +57,13 @@ def test_simulation_agrees_with_the_exact_answer(config, delay, mirror, frame_me
     assert abs(strehls.mean() - lbt.strehl(exact, config.imaging)) < 4 * scatter + 5e-4
 
 
-class Broken:
-    def step(self, _y):
-        return np.array([np.nan])
-
-    def reset(self):
-        pass
-
-
 def test_refusals(axis_plant, sensors_design, sensors_config):
     hardware, truth = axis_plant.hardware, lbt.Truth(turbulence=None, noise_nm=1)
     filters = lbt.kalman(axis_plant).controller
     line = lbt.models.SinusoidalVibration(frequency_hz=5, rms_nm=1)
     shaken = lbt.Truth(turbulence=None, vibrations=(line,))
     gain = lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0)
+    broken = SimpleNamespace(step=lambda _y: np.array([np.nan]), reset=lambda: None)
 
     def run(controller=filters, met=truth, **counts):
         return lambda: lbt.simulate(controller, met, hardware=hardware, **({"frames": 10} | counts))
@@ -80,7 +74,7 @@ def test_refusals(axis_plant, sensors_design, sensors_config):
 
     units = "called 'm3'; there are wavefront, slow, m1"
     rows = [
-        (run(Broken()), ProblemError, "must return 1 finite commands"),
+        (run(broken), ProblemError, "must return 1 finite commands"),
         (run("controller"), ProblemError, r"step\(y\) and reset\(\)"),
         (run(frames=0), ProblemError, "frames must be"),
         (run(cases=0), ProblemError, "cases must be"),
@@ -128,7 +122,6 @@ def test_a_step_is_answered_frame_by_frame():
 
 
 def failing_run(design, truth, *drops, frames=10_000):
-    """Two runs of the loop."""
     facts = {"cases": 2, "seed": 3, "hardware": design.hardware, "settle_frames": 1000}
     return lbt.simulate(design, truth, drops=[Drop(**x) for x in drops], frames=frames, **facts)
 

@@ -23,8 +23,8 @@ def ar_series(coefficients, driving, modes, frames, rng):
     return lfilter([1.0], [1.0, *(-np.array(coefficients))], white, axis=1)[:, 30_000:]
 
 
-def process(coefficients, driving_rms_nm):
-    return ARModel(coefficients=coefficients, driving_rms_nm=driving_rms_nm, frame_rate_hz=RATE)
+def process(coefficients, driving_nm):
+    return ARModel(coefficients=coefficients, driving_rms_nm=driving_nm, frame_rate_hz=RATE)
 
 
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,))
@@ -46,7 +46,6 @@ def best_integrator(path, truth):
 
 
 def air_of(pole, driving, modes=1):
-    """Return turbulence of first order, the same on all modes."""
     return process(np.full((modes, 1), pole), np.full(modes, driving))
 
 

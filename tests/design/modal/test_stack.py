@@ -1,27 +1,20 @@
 """A stack of one-mode designs: each is that of kalman, and the loops of all leave what one does."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from support import modal
 from support.effort import count_calls
 from support.lqg import shell
-from support.modal import (
-    HUM,
-    LINE,
-    RATE,
-    joint_controller,
-    path_of,
-    single_plant,
-    some_air,
-    tip_tilt_filter,
-)
+from support.modal import HUM, LINE, RATE, path_of, some_air, tip_tilt_filter
 from support.recorded_runs import recorded_run
-from support.refusals import require_refusals
+from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.design.modal import MixedController, modal_filters, stack
-from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.errors import CertificateError, DimensionError, NonFiniteError, ProblemError
 from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.ensemble import LoopEnsemble
 from lbt_synth.loop.evaluator import textbook_matrices
@@ -48,7 +41,7 @@ def test_each_filter_is_that_of_kalman(delay, order, mirror):
     path = filters.hardware
     assert (path.mirror, path.frame_rate_hz, path.delay_frames) == (mirror, RATE, delay)
     for i, mode_lines in enumerate(lines):
-        one = lbt.kalman(single_plant(air, i, mode_lines, noise[i], gain[i], **facts))
+        one = lbt.kalman(modal.single_plant(air, i, mode_lines, noise[i], gain[i], **facts))
         mine = filters.design(i)
         assert np.array_equal(mine.gain_predictor, one.gain_predictor)
         for name in "ABCD":
@@ -75,37 +68,51 @@ def test_a_failing_mode_is_named(monkeypatch):
 
     def failing(plant):
         if plant.turbulence[0].driving_rms_nm == air.driving_rms_nm[2]:
-            raise lbt.errors.CertificateError("no good", failed=("distance",))
+            raise CertificateError("no good", failed=("distance",))
         return lbt.kalman(plant)
 
     monkeypatch.setattr(stack, "kalman", failing)
-    with pytest.raises(lbt.errors.CertificateError, match="filter of mode 2: no good") as caught:
-        modal_filters(air, hardware=path_of(), noise_nm=10.0)
-    assert caught.value.failed == ("distance",)
+    call = partial(modal_filters, air, hardware=path_of(), noise_nm=10.0)
+    error = refused(call, CertificateError, "filter of mode 2: no good")
+    assert error.failed == ("distance",)
 
 
-def test_bad_filters_are_refused():
-    air = some_air(3)
+def test_refusals():
+    air, kalman, gains = some_air(3), tip_tilt_filter(), np.full(5, 0.4)
 
     def filters(noise_nm=1, **options):
         options = {"hardware": path_of(), "noise_nm": noise_nm} | options
         return lambda: modal_filters(air, **options)
 
-    made = modal_filters([air.take(0)], hardware=path_of(), noise_nm=1.0)
-    lines = "list of Vibration"
+    def mixed(gains=gains, **options):
+        return lambda: MixedController(gains=gains, **options)
+
+    two = modal_filters(some_air(2), hardware=path_of(), noise_nm=1.0)
+    lines, slower = "list of Vibration", path_of(frame_rate_hz=400)
     require_refusals(
         [
             (filters(0.0), ProblemError, "noise_nm must be above 0"),
             (filters([1.0, 2.0]), DimensionError, "one per mode .3."),
             (filters(np.nan), NonFiniteError, "noise_nm"),
             (filters(hardware=3), ProblemError, "hardware must be a LoopHardware"),
-            (filters(hardware=path_of(frame_rate_hz=400)), ProblemError, "loop's 400 Hz; got 800"),
+            (filters(hardware=slower), ProblemError, "loop's 400 Hz; got 800"),
             (filters(sensor_gain=-1), ProblemError, "sensor_gain must be above 0"),
             (filters(vibrations=[LINE]), ProblemError, "must be a mapping"),
             (filters(vibrations={3: LINE}), ProblemError, "must be at most 2; got 3"),
             (filters(vibrations={0: 3}), ProblemError, lines),
             (filters(vibrations={0: [1]}), ProblemError, lines),
-            (lambda: made.design(1), ProblemError, "mode must be at most 0; got 1"),
+            (lambda: two.design(2), ProblemError, "mode must be at most 1; got 2"),
+            (mixed(0.4, filter=kalman), DimensionError, "gains must be a list"),
+            (mixed([0.4, np.nan], filter=kalman), NonFiniteError, "gains must be finite"),
+            (mixed([-0.1]), ProblemError, "gains must be at least 0"),
+            (mixed(leak=1.1), ProblemError, "leak must be .*at most 1"),
+            (mixed(leak=[1, 1]), DimensionError, "leak must be one"),
+            (mixed(filter=kalman, filtered=(0,)), DimensionError, "1 filtered"),
+            (mixed(filter=kalman, filtered=(0, 5)), ProblemError, "at most 4"),
+            (mixed(filter=kalman, filtered=(1, 1)), ProblemError, "different mode numbers"),
+            (mixed(filter=kalman, filtered=()), ProblemError, "at least one; got"),
+            (mixed(filter=two, filtered=(0,)), DimensionError, "the 1 filtered modes; got 2"),
+            (mixed(filter=3), ProblemError, "filter must be a design"),
         ]
     )
 
@@ -117,22 +124,18 @@ def law(gain, leak=1.0):
 def controller_of(kind, n, delay):
     """Return a controller of n modes, and the controllers of some modes that it is made of."""
     air, gains, leak = some_air(n), np.linspace(0.1, 0.3, n), np.linspace(0.98, 1, n)
-    path = path_of(delay_frames=delay)
-    filters, filtered, parts = None, (), []
+    facts, filters, filtered = {"hardware": path_of(delay_frames=delay), "noise_nm": 8.0}, None, ()
     if kind == "filters":
-        filters = modal_filters(air, hardware=path, noise_nm=8.0, vibrations={0: [LINE]})
-        filtered = range(n)
-    elif kind == "mixed":
+        filters, filtered = modal_filters(air, vibrations={0: [LINE]}, **facts), range(n)
+    elif kind == "both":
+        filters, filtered = modal_filters([air.take(0)] * 2, **facts), (2, 0)
+    parts = [((mode,), filters.design(i).controller) for i, mode in enumerate(filtered)]
+    if kind == "mixed":
         filters, filtered = tip_tilt_filter(delay), (3, 1)
         parts = [(filtered, filters.controller)]
-    elif kind == "both":
-        filters = modal_filters([air.take(0)] * 2, hardware=path, noise_nm=8.0)
-        filtered = (2, 0)
-    if kind in ("filters", "both"):
-        parts = [((mode,), filters.design(i).controller) for i, mode in enumerate(filtered)]
     parts += [((i,), law(gains[i], leak[i])) for i in range(n) if i not in filtered]
-    known = {"filtered": filtered} if filters else {}
-    return MixedController(filter=filters, gains=gains, leak=leak, **known), parts
+    options = {"filtered": filtered} if filters else {}
+    return MixedController(filter=filters, gains=gains, leak=leak, **options), parts
 
 
 @pytest.mark.parametrize(
@@ -144,7 +147,7 @@ def test_stepped_modes_are_the_linear_controller_of_all(kind, delay):
     total, noise = np.random.default_rng(4).standard_normal((2, frames, n)) * [[[100]], [[8]]]
     path = path_of(delay_frames=delay, sensor_matrix=np.diag(np.linspace(0.6, 1.1, n)))
     stepped, linear = (
-        recorded_run(k, path, total, noise) for k in (controller, joint_controller(parts, n))
+        recorded_run(k, path, total, noise) for k in (controller, modal.joint_controller(parts, n))
     )
     assert np.allclose(stepped, linear, atol=1e-10 * np.abs(linear).max())
 
@@ -162,21 +165,15 @@ def test_a_process_that_is_all_but_a_walk_leaves_what_a_walk_leaves():
         assert left.rms_nm[1] == pytest.approx(walk, rel=1e-7)
 
 
-def test_step_is_the_recursion_written_out():
-    rng, kalman = np.random.default_rng(3), tip_tilt_filter()
-    gains, leak = rng.uniform(0, 1, 5), rng.uniform(0.9, 1, 5)
-    series = 30 * rng.standard_normal((60, 5))
-    run, command, expected = kalman.controller.start(), np.zeros(5), []
-    for modal in series:
-        command = leak * command + gains * modal
-        command[[3, 1]] = run.step(modal[[3, 1]])
-        expected.append(command)
+def test_a_filter_is_a_design_a_controller_or_a_run_and_begins_again():
+    kalman, series = tip_tilt_filter(), np.random.default_rng(3).standard_normal((60, 5))
+    commands = []
     for filters in (kalman, kalman.controller, kalman.controller.start()):
-        mixed = MixedController(filter=filters, gains=gains, filtered=(3, 1), leak=leak)
-        first = np.array([mixed.step(y) for y in series])
-        assert np.allclose(first, expected, atol=1e-9)
-        mixed.reset()
-        assert np.array_equal([mixed.step(y) for y in series], first)
+        mixed = MixedController(filter=filters, gains=np.full(5, 0.4), filtered=(3, 1))
+        for _ in range(2):
+            commands.append([mixed.step(y) for y in series])
+            mixed.reset()
+    np.testing.assert_array_equal(commands, commands[:1] * 6)
 
 
 def test_a_step_of_672_modes_enters_as_many_functions_as_one_of_two():
@@ -185,31 +182,6 @@ def test_a_step_of_672_modes_enters_as_many_functions_as_one_of_two():
     )
     many.step(np.ones(672))  # what only the first step does
     assert count_calls(many.step, np.ones(672)) <= count_calls(few.step, np.ones(2)) < 100
-
-
-def test_bad_mixed_controllers_are_refused():
-    kalman = tip_tilt_filter()
-    gains = np.full(5, 0.4)
-
-    def mixed(gains=gains, **options):
-        return lambda: MixedController(gains=gains, **options)
-
-    two = modal_filters(some_air(2), hardware=path_of(), noise_nm=1.0)
-    require_refusals(
-        [
-            (mixed(0.4, filter=kalman), DimensionError, "gains must be a list"),
-            (mixed([0.4, np.nan], filter=kalman), NonFiniteError, "gains must be finite"),
-            (mixed([-0.1]), ProblemError, "gains must be at least 0"),
-            (mixed(leak=1.1), ProblemError, "leak must be .*at most 1"),
-            (mixed(leak=[1, 1]), DimensionError, "leak must be one"),
-            (mixed(filter=kalman, filtered=(0,)), DimensionError, "1 filtered"),
-            (mixed(filter=kalman, filtered=(0, 5)), ProblemError, "at most 4"),
-            (mixed(filter=kalman, filtered=(1, 1)), ProblemError, "different mode numbers"),
-            (mixed(filter=kalman, filtered=()), ProblemError, "at least one; got"),
-            (mixed(filter=two, filtered=(0,)), DimensionError, "the 1 filtered modes; got 2"),
-            (mixed(filter=3), ProblemError, "filter must be a design"),
-        ]
-    )
 
 
 def test_bad_measurements_leave_the_state_alone():

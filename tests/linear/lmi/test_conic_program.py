@@ -4,13 +4,8 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from lbt_synth.linear.convex_functions import (
-    Discs,
-    Fractions,
-    FunctionBound,
-    HalfPlanes,
-    total_value,
-)
+from lbt_synth.linear import convex_functions
+from lbt_synth.linear.convex_functions import Discs, Fractions, FunctionBound, HalfPlanes
 from lbt_synth.linear.lmi.conic_program import minimize, minimize_relaxation
 
 SIZE, COUNT = 4, 20
@@ -27,7 +22,6 @@ def fractions(rng, *, worst=False):
 
 
 def stated(function, c):
-    """Return fractions as an expression of cvxpy."""
     values = [
         cp.sum_squares(cp.abs(centre + rows @ c))
         for centre, rows in zip(function.centres, function.rows, strict=True)
@@ -62,10 +56,10 @@ def test_the_optimum_is_that_of_the_statement(kinds, start):
     whole = sum(stated(part, c) for part in function)
     least = cp.Problem(cp.Minimize(whole), peer).solve(solver=cp.CLARABEL)
     origin = 0.05 * rng.standard_normal(SIZE) if start else None
-    scale = total_value(function, np.zeros(SIZE))
+    scale = convex_functions.total_value(function, np.zeros(SIZE))
     coefficients, status = minimize(function, ours, size=SIZE, scale=scale, start=origin)
     assert status == "optimal"
-    assert total_value(function, coefficients) == pytest.approx(least, rel=1e-6)
+    assert convex_functions.total_value(function, coefficients) == pytest.approx(least, rel=1e-6)
     np.testing.assert_allclose(coefficients, c.value, atol=2e-3)
     free = cp.Problem(cp.Minimize(whole)).solve(solver=cp.CLARABEL)
     assert least > free * (1 + 1e-4)  # the constraints matter

@@ -31,16 +31,20 @@ def slicot_norm(plant, gamma):
 
 
 # of 15, 863 and 637, an oscillation limits the level, a slack is exactly zero in the search, and X
-# grows without bound next to the level; of 73 and 257, storages differ by twelve orders
+# grows without bound next to the level; of 73 and 257, storages differ by twelve orders; the loop
+# of the lightly damped 291 is far from normal, 156 is refused next to its least level
 @pytest.mark.parametrize(
-    ("seed", "open_by"),
-    [*((seed, 1e-6) for seed in (1, 2, 4, 7, 12, 15, 863, 637)), (73, 1e-4), (257, 1e-4)],
+    ("plant", "below", "open_by"),
+    [
+        *((random_plant(seed), 1e-6, 1e-6) for seed in (1, 2, 4, 7, 12, 15, 863, 637)),
+        *((random_plant(seed), 1e-6, 1e-4) for seed in (73, 257)),
+        *((lightly_damped_plant(seed), 2e-6, 1e-5) for seed in (291, 156)),
+    ],
 )
-def test_slicot_reaches_no_less_and_the_witness_proves_it(seed, open_by):
-    plant = random_plant(seed)
+def test_slicot_reaches_no_less_and_the_witness_proves_it(plant, below, open_by):
     design = lbt.hinf_controller(plant)
     least = design.gamma_least
-    assert slicot_norm(plant, least * (1 - 1e-6)) > least * (1 - 1e-6)
+    assert slicot_norm(plant, least * (1 - below)) > least * (1 - below)
     assert slicot_norm(plant, least * 1.01) < least * 1.01
     assert least * (1 - open_by) < design.gamma_infeasible <= least
 
@@ -62,15 +66,6 @@ def test_what_is_pushed_and_not_measured_is_left_and_what_is_controlled_is_not()
     seen = GeneralizedPlant(**one, B1=np.ones((1, 3)), C1=1.0, C2=np.zeros((3, 1)), D21=np.eye(3))
     for plant in (seen, sampled_plant(8, n=3), sampled_plant(23, n=3)):
         assert lbt.hinf_controller(plant).gamma_least < 1e-9
-
-
-# the loop of the first is far from normal, the second is refused next to its least level
-@pytest.mark.parametrize("seed", [291, 156])
-def test_lightly_damped_modes_are_certified(seed):
-    plant = lightly_damped_plant(seed)
-    least = lbt.hinf_controller(plant).gamma_least
-    assert slicot_norm(plant, least * (1 - 2e-6)) > least * (1 - 2e-6)
-    assert slicot_norm(plant, least * 1.01) < least * 1.01
 
 
 def test_perfect_control_of_lightly_damped_modes_is_certified():

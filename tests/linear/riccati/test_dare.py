@@ -100,11 +100,9 @@ def random_stack(seed, count, n, m):
 
 def test_leading_dimensions_are_broadcast():
     A, B, Q, R, _ = random_stack(1, 4, 3, 1)
-    many = lbt.solve_dare(A[0], B[0], Q, R[0])
-    assert many.X.shape == (4, 3, 3)
+    many, empty = lbt.solve_dare(A[0], B[0], Q, R[0]), lbt.solve_dare(A[:0], B[0], Q[0], R[0])
+    assert (many.X.shape, empty.X.shape) == ((4, 3, 3), (0, 3, 3))
     assert np.allclose(many.X[2], lbt.solve_dare(A[0], B[0], Q[2], R[0]).X, rtol=1e-12)
-    empty = lbt.solve_dare(A[:0], B[0], Q[0], R[0])
-    assert empty.X.shape == (0, 3, 3)
     assert empty.residual == empty.error == 0
 
 
@@ -141,17 +139,14 @@ def test_indefinite_weights_against_slycot(seed, n):
 
 def test_badly_scaled_states_are_balanced():
     """States in units of 1e-6 to 1e6 times their own: the same solution, to rounding."""
-    rng = np.random.default_rng(4)
-    plant = lbt_axis_plant(damping=1e-4)
+    rng, plant = np.random.default_rng(4), lbt_axis_plant(damping=1e-4)
     exact = lbt.solve_dare(plant.A.T, plant.C.T, plant.Q, plant.R).X
-    for _ in range(5):
-        units = 10.0 ** rng.uniform(-6, 6, 4)
-        A, C = plant.A * units[:, None] / units, plant.C / units
-        found = lbt.solve_dare(A.T, C.T, plant.Q * np.outer(units, units), plant.R)
-        assert found.route == "doubling"
-        assert np.allclose(
-            found.X / np.outer(units, units), exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max()
-        )
+    for units in 10.0 ** rng.uniform(-6, 6, (5, 4)):
+        A, C, both = plant.A * units[:, None] / units, plant.C / units, np.outer(units, units)
+        solution = lbt.solve_dare(A.T, C.T, plant.Q * both, plant.R)
+        assert solution.route == "doubling"
+        limit = 1e-9 * np.abs(exact).max()
+        assert np.allclose(solution.X / both, exact, rtol=1e-9, atol=limit)
 
 
 def test_the_schur_form_takes_over_where_doubling_fails(monkeypatch):

@@ -90,7 +90,6 @@ def test_the_bracket_is_closed(seed, n, q, l):
 
 
 def slow_line(rate_hz, frequency_hz, damping, rms_nm, noise_nm):
-    """One axis with AR1 turbulence and a line."""
     air = lbt.models.ARModel(coefficients=[0.9986], driving_rms_nm=22.7, frame_rate_hz=rate_hz)
     line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=rms_nm, direction=(1,))
     facts = {"frame_rate_hz": rate_hz, "noise_nm": noise_nm, "modes": 1}
@@ -179,12 +178,6 @@ def test_the_error_of_an_hinf_filter_is_below_its_level(seed):
 def walk(**changes):
     parts = {"A": [[[1.0]]], "B": [[[1.0, 0.0]]], "C": [[[1.0]]], "D": [[[0.0, 1.0]]]}
     return EstimationProblem(**(parts | changes), L=[[1.0]], read=[[True], [False]])
-
-
-def test_a_walk_that_is_read_in_every_second_sample():
-    # P0 = P + 1 and P = P0 / (1 + P0) + 1: P0^2 - 2 P0 - 2 = 0
-    P = kalman_riccati(walk()).P.ravel()
-    assert P == pytest.approx([1 + np.sqrt(3), np.sqrt(3)], rel=1e-12)
 
 
 def test_equations_that_are_not_solved(monkeypatch):
