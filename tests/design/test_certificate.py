@@ -70,9 +70,8 @@ def test_a_gain_beside_the_optimal_one_is_refused_from_a_millionth_on(axis_plant
 
 def test_what_is_no_witness_of_the_problem_is_refused():
     problem = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    nothing, wide = (
-        Witness(states=np.zeros((n, 1)), disturbances=np.zeros((2, 1))) for n in (1, 2)
-    )
+    still = np.zeros((2, 1))
+    nothing, wide = (Witness(states=np.zeros((n, 1)), disturbances=still) for n in (1, 2))
     assert certify_infeasible(problem, 0.0, nothing).passed  # a level of zero claims nothing
     assert not certify_infeasible(problem, 1e-3, nothing).passed
     words = r"1 rows of states, 2 rows of disturbances .*; got \(2, 1\) and \(2, 1\)"

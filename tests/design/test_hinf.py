@@ -35,17 +35,14 @@ def test_the_numbers_of_the_lbt(axis_plant):
 
 def test_both_routes_bracket_slow_wind_shake_of_thousands_of_nanometres():
     """The ELT's template has poles of modulus 0.9999, and 8 um beside noise of 3 nm."""
-    facts = {"coefficients": [1.998866, -0.99887], "driving_rms_nm": 0.85}
+    facts = {"coefficients": [1.998866, -0.99887], "driving_rms_nm": 0.85, "frame_rate_hz": 1000}
+    slow = lbt.models.ARModel(**facts)
     shakes = [
         lbt.Vibration(frequency_hz=f, damping=0.3, rms_nm=rms, direction=way)
         for f, rms, way in ((0.75, 340.0, (1, 0)), (0.3, 8090.0, (0, 1)))
     ]
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=1000,
-        turbulence=lbt.models.ARModel(**facts, frame_rate_hz=1000),
-        vibrations=shakes,
-        noise_nm=2.7,
-    )
+    facts = {"frame_rate_hz": 1000, "noise_nm": 2.7}
+    plant = lbt.tip_tilt_plant(turbulence=slow, vibrations=shakes, **facts)
     lmi, riccati = (lbt.hinf(plant, gamma_ratio=1.2, route=m) for m in ("lmi", "riccati"))
     assert riccati.gamma_least == pytest.approx(lmi.gamma_least, rel=1e-7)
     assert riccati.gamma_infeasible == pytest.approx(riccati.gamma_least, rel=1e-7)
@@ -109,10 +106,9 @@ def test_many_sensors_of_one_state_at_the_least_gamma(seed):
 
 
 def test_weakly_driven_modes_and_odd_units_are_not_refused():
+    parts = {"A": np.diag([1.0, 0.5]), "D": [[0, 0, 1]]}
     weak, units = (
-        lbt.EstimationProblem(
-            A=np.diag([1.0, 0.5]), B=[[b, 0, 0], [0, 1, 0]], C=[[c, 1]], D=[[0, 0, 1]], L=[[c, 1]]
-        )
+        lbt.EstimationProblem(**parts, B=[[b, 0, 0], [0, 1, 0]], C=[[c, 1]], L=[[c, 1]])
         for b, c in ((1e-6, 1), (1e11, 1e-11))
     )
     assert lbt.kalman(weak).certificate.passed

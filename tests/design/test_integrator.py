@@ -110,9 +110,8 @@ def test_a_law_has_its_response_and_the_loop_the_poles_of_its_polynomial(law, ga
     f = np.array([1.0, 20.0, 300.0])
     z = np.exp(2j * np.pi * f / RATE)
     response = design.controller.to_statespace().frequency_response(f)[:, 0, 0]
-    assert np.allclose(
-        response, gain * (1 - c / z) / (1 - law.leak / z) ** law.integrators, rtol=1e-9
-    )
+    expected = gain * (1 - c / z) / (1 - law.leak / z) ** law.integrators
+    assert np.allclose(response, expected, rtol=1e-9)
 
 
 def test_a_double_integrator_is_stable_where_its_zero_leads_more_than_the_delay_lags():

@@ -25,10 +25,6 @@ def model_rms(plant, controller):
     return lbt.residual_budget(lbt.close_loop(plant.hardware, controller), plant).rms_nm
 
 
-def truth_of(plant, noise_nm=15.5):
-    return lbt.Truth(turbulence=plant.turbulence[0], noise_nm=noise_nm)
-
-
 @pytest.mark.parametrize(("delay", "modes"), [(1.0, 1), (2.49, 1), (3.0, 2)])
 def test_a_settled_mirror_gives_the_kalman_controller_and_reaches_the_limit(delay, modes):
     plant = slow_plant(delay, modes=modes)
@@ -115,7 +111,7 @@ def test_the_other_designs_take_a_moving_mirror():
     slow = ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
     facts = {"vibrations": (), "turbulence": slow, "noise_nm": 20.0}
     plant = slow_plant(2.25, shell(300.0), **facts)
-    truth, path = truth_of(plant, 20.0), plant.hardware
+    truth, path = lbt.Truth(turbulence=slow, noise_nm=20.0), plant.hardware
     terms = [ResidualVariance(turbulence=slow, noise_nm=20.0)]
     robust = shaped(margin(0.5), terms=terms, path=path, functions=25)
     integrator = lbt.integrator(path, truth=truth)

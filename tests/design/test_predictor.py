@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from support.predictors import BASE, HEARING, PATH, coefficients, made, readings
+from support.refusals import refused
 
 import lbt_synth as lbt
 from lbt_synth.design import predictor
@@ -109,8 +111,8 @@ def test_a_channel_that_fails_takes_the_fallback_without_a_jump() -> None:
         run.miss({"wavefront"})
 
 
-def test_a_predictor_needs_a_record() -> None:
-    with pytest.raises(ProblemError, match="the method predictor is made of a record"):
-        lbt.load_config("examples/lbt.yaml").design("predictor")
-    with pytest.raises(ProblemError, match="one filter, and a fall-back"):
-        predictor.predictor_design(HEARING, [BASE], readings(), 1.0, what="test")
+def test_a_predictor_needs_a_record(config) -> None:
+    single = partial(predictor.predictor_design, HEARING, [BASE], readings(), 1.0, what="test")
+    refused(single, ProblemError, "one filter, and a fall-back")
+    design = partial(config.design, "predictor")
+    refused(design, ProblemError, "the method predictor is made of a record")

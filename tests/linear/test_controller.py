@@ -22,10 +22,6 @@ def law(path=PATH, **changes):
     return lbt.integrator(path, gain=0.3, law=lbt.design.IntegratorLaw(**changes))
 
 
-def shaped_for(delay):
-    return shaped(path=replace(ONE, delay_frames=delay), functions=8)
-
-
 DESIGNS = {
     "kalman": lambda: lbt.kalman(lbt_config().plant),
     "hinf": lambda: lbt.hinf(lbt_config().plant, gamma_ratio=1.2, route="riccati"),
@@ -35,8 +31,9 @@ DESIGNS = {
     "leak": lambda: law(leak=0.98),
     "zero": lambda: law(zero_hz=20.0),
     "two": lambda: law(integrators=2, zero_hz=20.0),
-    "fast": lambda: shaped_for(1),  # a command that acts on the next measurement
-    "late": lambda: shaped_for(2.4),
+    # a command that acts on the next measurement
+    "fast": lambda: shaped(path=replace(ONE, delay_frames=1), functions=8),
+    "late": lambda: shaped(path=replace(ONE, delay_frames=2.4), functions=8),
 }
 
 

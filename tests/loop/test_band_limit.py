@@ -15,12 +15,9 @@ from lbt_synth.loop.band_limit import least_worst_residual
 
 def test_band_of_the_example(config):
     line, hardware, truth = config.truth.vibrations[0], config.hardware, config.truth
-    means, image = (
-        least_worst_residual(
-            hardware, truth, band_hz=(16.5, 23.5), rms_nm=line.rms_nm, frame_means=frame_means
-        )
-        for frame_means in (True, False)
-    )
+    band = {"band_hz": (16.5, 23.5), "rms_nm": line.rms_nm}
+    means = least_worst_residual(hardware, truth, **band, frame_means=True)
+    image = least_worst_residual(hardware, truth, **band)
     assert means.rms_nm == pytest.approx(15.1088, abs=1e-4)
     assert means.rms_nm <= means.achieved_nm < means.rms_nm * (1 + 1e-8)
     assert means.weight.sum() == pytest.approx(1)

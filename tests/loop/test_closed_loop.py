@@ -26,17 +26,15 @@ def test_the_page_says_where_the_settled_design_becomes_unstable(config):
 
 
 @pytest.mark.parametrize("moving", [None, SHELL])
-@pytest.mark.parametrize(
-    ("delay", "feedthrough"), [(1.0, False), (1.0, True), (1.4, True), (4.0, True)]
-)
-def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough, moving):
+@pytest.mark.parametrize(("delay", "direct"), [(1.0, False), (1.0, True), (1.4, True), (4.0, True)])
+def test_the_closed_loop_is_affine_in_the_filter(delay, direct, moving):
     rng = np.random.default_rng(3)
     sensor = np.array([[1.0, 0.2], [0.0, 0.8], [0.1, 0.1]])
     mirror = np.array([[1.0, 0.1], [-0.2, 0.9]])
     matrices = {"sensor_matrix": sensor, "influence_matrix": mirror, "mirror": moving}
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, **matrices)
     B, C, D = (rng.normal(size=size) for size in ((3, 3), (2, 3), (2, 3)))
-    parts = {"A": np.diag([0.9, 0.4, -0.5]), "B": B, "C": C, "D": D * feedthrough}
+    parts = {"A": np.diag([0.9, 0.4, -0.5]), "B": B, "C": C, "D": D * direct}
     parameter = lbt.Controller(**parts, dt_s=1 / 800)
     loop = lbt.close_loop(path, youla_controller(path, parameter))
     assert loop.is_stable

@@ -159,11 +159,8 @@ def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
 
 def test_a_loop_is_split_into_parts():
     # an axis without a vibration is another part than one with
-    for name, modes in (
-        ("kalman", [[[0], [1]]]),
-        ("coupled", [[[0, 1]]]),
-        ("uneven", [[[0]], [[1]]]),
-    ):
+    expected = {"kalman": [[[0], [1]]], "coupled": [[[0, 1]]], "uneven": [[[0]], [[1]]]}
+    for name, modes in expected.items():
         matrices = textbook_matrices([designed(name).controller])
         parts, rest = split_into_parts(matrices, designed(name).hardware)
         assert ([own.tolist() for own, *_ in parts], rest) == (modes, [])

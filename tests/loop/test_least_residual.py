@@ -146,9 +146,8 @@ def coupled_plant(ratio=2.0, **options):
     """A line along a diagonal over turbulence of another size on either axis."""
     slow = [ar(1.98, -0.9805, driving=driving) for driving in (1.0, ratio)]
     line = lbt.Vibration(frequency_hz=30, damping=0.01, rms_nm=50, direction=(1, 1))
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=slow, vibrations=[line], noise_nm=10.0, **options
-    )
+    facts = {"turbulence": slow, "vibrations": [line], "noise_nm": 10.0}
+    return lbt.tip_tilt_plant(frame_rate_hz=RATE, **facts, **options)
 
 
 @pytest.mark.parametrize("delay", [1.0, 3.0])

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from support.lqg import shell
 from support.refusals import refused
 from support.sensor_loops import example_plant
 
@@ -67,9 +68,8 @@ def test_loops_without_a_crossing_and_of_two_integrators():
 
 
 def test_equal_axes_share_a_response_and_others_have_their_own():
-    assert [response.measurements for response in broken_loops(loop_of(0.3, modes=3))] == [
-        (0, 1, 2)
-    ]
+    (shared,) = broken_loops(loop_of(0.3, modes=3))
+    assert shared.measurements == (0, 1, 2)
     loop = loop_of((0.2, 0.4, 0.2), modes=3)
     responses = broken_loops(loop)
     assert [response.measurements for response in responses] == [(0, 2), (1,)]
@@ -177,10 +177,7 @@ def test_a_loop_that_needs_its_delay_has_an_early_margin(delay, pole):
 
 def test_a_delay_margin_may_be_longer_than_any_delay():
     """A slow loop bears more delay than a loop is made with; of a slow mirror the mean counts."""
-    shell = lbt.models.PositionLoop.from_bandwidth(
-        natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=8000
-    )
-    slow = loop_of(0.03, mirror=shell)
+    slow = loop_of(0.03, mirror=shell(300, natural_frequency_hz=50, sampling_hz=8000))
     margin, taps = lbt.loop_margins(slow).delay_frames, slow.hardware.mirror_taps
     limit = 0.5 + np.pi / (4 * np.arcsin(0.03 / 2))  # delay at which the gain is the limit
     assert 1 + taps @ np.arange(taps.size) + margin == pytest.approx(limit, abs=0.1)

@@ -182,9 +182,7 @@ def test_a_common_lyapunov_function_of_clips_exists_inside_and_none_beyond():
     _, ratio = strokes(*one_pole(1.0, delay_frames=3))
     assert 2 < ratio < 4
     for factor, proved in ((0.99, True), (1.01, False)):
-        clips = [
-            np.array([[d, 0, -0.5 * d], [1, 0, 0], [0, 1, 0]]) for d in (1 / (factor * ratio), 1)
-        ]
+        clips = [np.array([[d, 0, -d / 2], [1, 0, 0], [0, 1, 0]]) for d in (1 / factor / ratio, 1)]
         assert (common_lyapunov(*clips) > 0) == proved
 
 

@@ -31,8 +31,8 @@ def pupil_otf(obstruction, size=512):
 
 @pytest.mark.parametrize("obstruction", [0.0, 0.4])
 def test_otf_is_the_autocorrelation_of_the_pupil(obstruction):
-    (x, y), otf = pupil_otf(obstruction)
-    radius = np.hypot(x, y)
+    coordinates, otf = pupil_otf(obstruction)
+    radius = np.hypot(*coordinates)
     inside = radius < 0.99
     assert np.max(np.abs(annular_otf(radius[inside], obstruction) - otf[inside])) < 4e-3
 

@@ -122,10 +122,8 @@ def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
 def test_bad_input_is_refused():
     ar1, series = process([0.9], 1.0), np.zeros((3000, 2))
     # a spectrum that is below zero at low frequencies, and lines that no quadrature finds twice
-    odd, comb = (
-        Anonymous(lambda f: np.where(f > 10, -1.0, 1.0)),
-        Anonymous(lambda f: np.sin(1e9 * f) ** 200),
-    )
+    odd = Anonymous(lambda f: np.where(f > 10, -1.0, 1.0))
+    comb = Anonymous(lambda f: np.sin(1e9 * f) ** 200)
     nothing = TabulatedSpectrum(frequency_hz=[0, 1], density_nm2_hz=[0, 0])
 
     def gains(spectra=(ar1,), noise_nm=1, **changes):

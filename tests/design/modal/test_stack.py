@@ -146,9 +146,8 @@ def test_stepped_modes_are_the_linear_controller_of_all(kind, delay):
     controller, parts = controller_of(kind, n, delay)
     total, noise = np.random.default_rng(4).standard_normal((2, frames, n)) * [[[100]], [[8]]]
     path = path_of(delay_frames=delay, sensor_matrix=np.diag(np.linspace(0.6, 1.1, n)))
-    stepped, linear = (
-        recorded_run(k, path, total, noise) for k in (controller, modal.joint_controller(parts, n))
-    )
+    joint = modal.joint_controller(parts, n)
+    stepped, linear = (recorded_run(k, path, total, noise) for k in (controller, joint))
     assert np.allclose(stepped, linear, atol=1e-10 * np.abs(linear).max())
 
 
@@ -177,9 +176,8 @@ def test_a_filter_is_a_design_a_controller_or_a_run_and_begins_again():
 
 
 def test_a_step_of_672_modes_enters_as_many_functions_as_one_of_two():
-    few, many = (
-        MixedController(filter=tip_tilt_filter(), gains=np.full(modes, 0.4)) for modes in (2, 672)
-    )
+    kalman, gains = tip_tilt_filter(), (np.full(modes, 0.4) for modes in (2, 672))
+    few, many = (MixedController(filter=kalman, gains=numbers) for numbers in gains)
     many.step(np.ones(672))  # what only the first step does
     assert count_calls(many.step, np.ones(672)) <= count_calls(few.step, np.ones(2)) < 100
 

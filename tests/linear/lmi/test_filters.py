@@ -1,7 +1,5 @@
 """Filters by inequalities, part by part, and the programme of the mixed filter."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -50,11 +48,10 @@ def test_axes_that_have_nothing_in_common_stay_apart(seed):
 def test_a_programme_that_did_not_end_gives_no_filter(monkeypatch):
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     monkeypatch.setattr(filters, "solve", lambda *_: ("user_limit", 200))
-    kalman, least = (
-        partial(f, walk, coordinates=np.eye(1), scale=1.0) for f in (kalman_sdp, least_gamma_lmi)
-    )
-    refused(kalman, NumericalError, "of the Kalman filter ended as")
-    refused(least, NumericalError, r"least gamma's .* ended as")
+    facts = {"coordinates": np.eye(1), "scale": 1.0}
+    words = "of the Kalman filter ended as"
+    refused(lambda: kalman_sdp(walk, **facts), NumericalError, words)
+    refused(lambda: least_gamma_lmi(walk, **facts), NumericalError, r"least gamma's .* ended as")
 
 
 GRID_HZ = np.linspace(0, 0.5, 30)

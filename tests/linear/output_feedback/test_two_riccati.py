@@ -149,15 +149,13 @@ def test_levels_scale_with_the_units_of_all_signals(plant):
         y, u = 10 ** (part * size_y)[:, None], 10 ** (part * size_u)
         units = {"B1": w, "B2": u, "C1": z, "C2": y, "D11": z * w, "D12": z * u, "D21": w * y}
         units |= {"D22": y * u}
-        other = replace(
-            plant, **{name: unit * getattr(plant, name) for name, unit in units.items()}
-        )
+        parts = {name: unit * getattr(plant, name) for name, unit in units.items()}
+        other = replace(plant, **parts)
         scaled = lbt.hinf_controller(other)
-        levels = np.array([design.gamma, design.gamma_infeasible, least_rms])
+        expected = z * w * np.array([design.gamma, design.gamma_infeasible, least_rms])
         rms = lbt.h2_controller(other).rms
-        assert (scaled.gamma, scaled.gamma_infeasible, rms) == pytest.approx(
-            z * w * levels, rel=1e-4
-        )
+        levels = scaled.gamma, scaled.gamma_infeasible, rms
+        assert levels == pytest.approx(expected, rel=1e-4)
         assert scaled.gamma_infeasible <= scaled.gamma * (1 + 1e-9)
         norm = float(lbt.hinf_norm(other.closed_loop(scaled.controller)))
         assert norm == pytest.approx(scaled.gamma, rel=1e-6)

@@ -1,6 +1,7 @@
 """solve_dare against published examples, closed forms and other solvers."""
 
 import contextlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from support.plants import lbt_axis_plant
 from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
-from lbt_synth.errors import DetectabilityError, NumericalError
+from lbt_synth.errors import DetectabilityError, NumericalError, ProblemError
 from lbt_synth.linear import GeneralizedPlant
 from lbt_synth.linear.riccati import dare
 
@@ -49,44 +50,37 @@ def test_random_equations_against_scipy(seed, n, m):
 EYE, TWO = np.eye(2), np.ones((2, 1))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ((EYE, np.ones((3, 1)), EYE, 1), r"B must have 2 rows to match A \(2, 2\)"),
-        ((EYE, TWO, np.eye(3), 1), "Q must have 2 rows"),
-        ((EYE, TWO, EYE, EYE), "R must have 1 row "),
-        ((EYE, TWO, [[1, 1], [0, 1]], 1), "Q must be symmetric"),
-        ((EYE, np.zeros((2, 0)), EYE, np.zeros((0, 0))), "at least one column"),
-        ((0.5 * EYE, np.ones((2, 2)), EYE, np.zeros((2, 2))), "R must be positive def"),
-        ((EYE, TWO, EYE, np.nan), "R must be finite"),
-        ((EYE[None], TWO, EYE, 1, np.ones((3, 1))), "S must have 2 rows"),
-        ((np.ones((2, 1, 1)), 1, np.ones((3, 1, 1)), 1), "leading dimensions.*A .2, 1, 1."),
-        ((1, 1, [1], 1), "Q must be a matrix .2-D. or a stack"),
-    ],
-)
-def test_wrong_equations_are_refused(arguments, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
-        lbt.solve_dare(*arguments)
-
-
-BAD = np.array([[[0.5]], [[2.0]], [[0.5]]]), np.array([[[1.0]], [[0.0]], [[1.0]]])
+WRONG = [
+    (EYE, np.ones((3, 1)), EYE, 1, r"B must have 2 rows to match A \(2, 2\)"),
+    (EYE, TWO, np.eye(3), 1, "Q must have 2 rows"),
+    (EYE, TWO, EYE, EYE, "R must have 1 row "),
+    (EYE, TWO, [[1, 1], [0, 1]], 1, "Q must be symmetric"),
+    (EYE, np.zeros((2, 0)), EYE, np.zeros((0, 0)), "at least one column"),
+    (0.5 * EYE, np.ones((2, 2)), EYE, np.zeros((2, 2)), "R must be positive def"),
+    (EYE, TWO, EYE, np.nan, "R must be finite"),
+    (EYE[None], TWO, EYE, 1, np.ones((3, 1)), "S must have 2 rows"),
+    (np.ones((2, 1, 1)), 1, np.ones((3, 1, 1)), 1, "leading dimensions.*A .2, 1, 1."),
+    (1, 1, [1], 1, "Q must be a matrix .2-D. or a stack"),
+]
 
 
 def test_equations_without_a_solution_are_refused():
     solve, hidden = lbt.solve_dare, DetectabilityError
+    A, B = np.array([[[0.5]], [[2.0]], [[0.5]]]), np.array([[[1.0]], [[0.0]], [[1.0]]])
     undriven = lbt.EstimationProblem(A=1.0, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     mode = np.array([[5.0, 4.0, 3.0, 2.0, 1.0]]).T  # no measurement shows it
     growing, seen = 0.5 * np.eye(5) + 1.5 * mode @ mode.T / 55, [[1.0, -1.0, -1.0, 1.0, 0.0]]
     plant = GeneralizedPlant(A=growing, B1=mode, B2=mode, C1=mode.T, C2=seen)
     rows = [
-        (lambda: solve(*BAD, 1, 1), hidden, r"equation 1: \(A, B\) must be stabilis.* at 2"),
-        (lambda: solve(BAD[0][None], BAD[1][None], 1, 1), hidden, r"equation \(0, 1\)"),
+        (lambda: solve(A, B, 1, 1), hidden, r"equation 1: \(A, B\) must be stabilis.* at 2"),
+        (lambda: solve(A[None], B[None], 1, 1), hidden, r"equation \(0, 1\)"),
         (lambda: lbt.kalman(undriven), hidden, r"driven by noise; the mode of A at 1 "),
         (lambda: solve(1, 1, 0, 1), hidden, "Q must see every mode on the unit circle"),
         (lambda: solve(2, 1, 1, 1, 1), hidden, "Q must see every mode"),  # 1 without its S is 0
         (lambda: lbt.h2_controller(plant), hidden, r"0 \(1\), 1 \(0.8\), .* 3 \(0.4\), \.\.\."),
         (lambda: solve(0.5, 1, 0, 0), NumericalError, "gave no stable closed loop"),
     ]
+    rows += [(partial(solve, *parts), ProblemError, words) for *parts, words in WRONG]
     require_refusals(rows)
 
 
@@ -150,18 +144,17 @@ def test_badly_scaled_states_are_balanced():
 
 
 def test_the_schur_form_takes_over_where_doubling_fails(monkeypatch):
+    solve = partial(lbt.solve_dare, 1, 1, 1 / 16, 1.25)
     for X in (np.nan, -0.25):  # 16 x^2 = x + 5 / 4; the pole of this root is 1.25
         monkeypatch.setattr(dare, "solve_by_doubling", lambda e, X=X: (np.full_like(e.Q, X), 1))
-        solution = lbt.solve_dare(1, 1, 1 / 16, 1.25)
+        solution = solve()
         assert solution.X[0, 0] == pytest.approx(0.3125, rel=1e-14)
         assert solution.route == "schur"
     monkeypatch.setattr(dare, "solve_by_schur", lambda equations: np.full_like(equations.Q, X))
-    with pytest.raises(NumericalError, match="gave no stable closed loop"):
-        lbt.solve_dare(1, 1, 1 / 16, 1.25)
+    refused(solve, NumericalError, "gave no stable closed loop")
     monkeypatch.undo()
     monkeypatch.setattr(dare, "RESIDUAL_LIMIT", -1.0)
-    with pytest.raises(NumericalError, match=r"and a pole 0\.2 inside the unit circle"):
-        lbt.solve_dare(1, 1, 1 / 16, 1.25)
+    refused(solve, NumericalError, r"and a pole 0\.2 inside the unit circle")
 
 
 def test_sizes_from_1e_minus_300_to_1e300():
