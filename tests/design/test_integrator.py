@@ -1,14 +1,15 @@
 """Integrators: their limits, their best gains, and laws with leak, zero and demands."""
 
-import dataclasses
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.predictions import a_plant, truth_of_all_moments
 from support.refusals import require_refusals
-from support.uneven_axes import LOOPS, QUICK, RATE, SLOW
+from support.uneven_axes import QUICK, RATE, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.design import IntegratorLaw, integrator, integrator_gain_limit
@@ -18,27 +19,14 @@ from lbt_synth.models import ARModel
 PATH = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
 
 
-@pytest.mark.parametrize(("delay", "limit"), [(1, 2.0), (2, 1.0), (3, 0.618034), (4, 0.445042)])
-def test_limits_of_whole_delays(delay, limit):
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
-    assert integrator_gain_limit(path) == pytest.approx(limit, abs=1e-6)
-
-
 @settings(max_examples=10)
 @given(delay=st.floats(1, 4.5))
+@example(4.0)
 def test_the_limit_is_where_the_loop_turns_unstable(delay):
     path = lbt.LoopHardware(frame_rate_hz=1, delay_frames=delay, modes=1)
-    limit = integrator_gain_limit(path)
-    for factor, is_stable in ((1 - 1e-4, True), (1 + 1e-4, False)):
-        controller = lbt.Controller(A=1.0, B=factor * limit, C=1.0, D=0.0)
-        assert (lbt.close_loop(path, controller).spectral_radius < 1) == is_stable
-
-
-def residual_of(path, truth, gain, sensor_gain=1.0):
-    """Return what an integrator of a gain leaves [nm]."""
-    controller = lbt.integrator(path, gain=gain).controller
-    loop = lbt.close_loop(path, controller, sensor_gain=sensor_gain)
-    return lbt.residual_budget(loop, truth).rms_nm
+    gains = integrator_gain_limit(path) * np.array([1 - 1e-4, 1 + 1e-4])
+    laws = [lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0) for gain in gains]
+    assert [lbt.close_loop(path, law).spectral_radius < 1 for law in laws] == [True, False]
 
 
 @pytest.mark.parametrize("sensor_gain", [1.0, 0.6])
@@ -47,12 +35,13 @@ def test_the_best_gain_is_the_least_of_two_minima(sensor_gain):
     path = lbt.LoopHardware(frame_rate_hz=500, delay_frames=3, modes=1)
     line = lbt.models.SinusoidalVibration(frequency_hz=28.5, rms_nm=38.76, direction=(1,))
     air = ARModel(coefficients=[0.9926], driving_rms_nm=2.27, frame_rate_hz=500)
-    noise_nm = 6.94 * sensor_gain
-    known = {"vibrations": (line,), "noise_nm": noise_nm, "sensor_gain": sensor_gain}
-    truth = lbt.Truth(turbulence=air, **known)
+    facts = {"noise_nm": 6.94 * sensor_gain, "sensor_gain": sensor_gain}
+    truth = lbt.Truth(turbulence=air, vibrations=(line,), **facts)
 
     def residual(gain):
-        return residual_of(path, truth, gain / sensor_gain, sensor_gain)
+        law = lbt.integrator(path, gain=gain / sensor_gain)
+        loop = lbt.close_loop(path, law, sensor_gain=sensor_gain)
+        return lbt.residual_budget(loop, truth).rms_nm
 
     best = residual(integrator(path, truth=truth).gain * sensor_gain)
     assert residual(0.0117) < min(residual(0.005), residual(0.03))  # the other minimum
@@ -63,10 +52,11 @@ def test_reconstructor_inverts_any_sensor():
     rng = np.random.default_rng(0)
     sensor, influence = rng.standard_normal((5, 2)), rng.standard_normal((2, 2))
     path = lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=sensor, influence_matrix=influence)
-    one, other = (
-        lbt.close_loop(p, lbt.integrator(p, gain=0.4).controller).sensitivity([0.5, 10, 100])
+    loops = (
+        lbt.close_loop(p, lbt.integrator(p, gain=0.4))
         for p in (path, lbt.LoopHardware(frame_rate_hz=800))
     )
+    one, other = (loop.sensitivity([0.5, 10, 100]) for loop in loops)
     assert np.allclose(one, other, atol=1e-12)
 
 
@@ -78,31 +68,11 @@ def test_the_integrator_of_a_plant_is_that_of_its_truth():
     assert design.certificate.passed
 
 
-def test_truths_of_other_loops_are_refused():
-    two = lbt.Truth(turbulence=[SLOW, QUICK], noise_nm=5.0)
-    noisy = lbt.Truth(turbulence=SLOW, noise_nm=[5, 5])
-    modes, measurements = r"one per mode \(1\); got 2", r"one per measurement \(1\); got 2"
-    law = integrator(LOOPS[1], gain=0.4)
-    known = {"frame_rate_hz": RATE, "turbulence": SLOW, "noise_nm": [1.0]}
-    rows = [
-        (lambda: integrator(LOOPS[1], truth=two), DimensionError, modes),
-        (lambda: integrator(LOOPS[1], truth=noisy), DimensionError, measurements),
-        (lambda: lbt.loop.least_residual(LOOPS[1], two), DimensionError, modes),
-        (lambda: lbt.simulate(law, two, hardware=LOOPS[1], frames=9), DimensionError, modes),
-        (lambda: lbt.tip_tilt_plant(**known), DimensionError, "measurement"),
-    ]
-    require_refusals(rows)
-
-
 def test_where_no_loop_is_best_the_status_says_so():
     """White noise alone: each gain adds to it, the least that is tried adds least."""
     idle = integrator(PATH, truth=lbt.Truth(turbulence=None, noise_nm=20.0))
     assert idle.solver.status.startswith("limited by the least gain tried")
     assert idle.gain == pytest.approx(1e-4, rel=1e-3)
-
-
-def zero_of(law):
-    return 0 if law.zero_hz is None else np.exp(-2 * np.pi * law.zero_hz / RATE)
 
 
 def test_margins_of_a_pure_integrator_have_closed_forms():
@@ -113,8 +83,7 @@ def test_margins_of_a_pure_integrator_have_closed_forms():
         assert lbt.loop_margins(lbt.close_loop(PATH, design.controller)).phase_deg >= demand
     design = lbt.integrator(PATH, law=IntegratorLaw(modulus_margin=0.5))
     z = np.exp(1j * np.linspace(1e-4, np.pi, 200_001))
-    distance = np.abs(1 + design.gain * z**-2 / (1 - 1 / z))
-    assert distance.min() == pytest.approx(0.5, abs=1e-7)
+    assert np.abs(1 + design.gain * z**-2 / (1 - 1 / z)).min() == pytest.approx(0.5, abs=1e-7)
 
 
 LAWS = [
@@ -129,9 +98,10 @@ LAWS = [
 def test_a_law_has_its_response_and_the_loop_the_poles_of_its_polynomial(law, gain, delay):
     """``(1 - leak z^-1)^n + g z^-d (1 - c z^-1) = 0``."""
     hardware = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
-    design, c = lbt.integrator(hardware, gain=gain, law=law), zero_of(law)
-    late = np.poly1d([1.0] + [0.0] * (delay + 1))
-    zero = np.poly1d([gain, -gain * c]) * np.poly1d([1.0] + [0.0] * law.integrators)
+    design = lbt.integrator(hardware, gain=gain, law=law)
+    c = 0 if law.zero_hz is None else np.exp(-2 * np.pi * law.zero_hz / RATE)
+    late, double = (np.poly1d([1.0] + [0.0] * n) for n in (delay + 1, law.integrators))
+    zero = np.poly1d([gain, -gain * c]) * double
     expected = (np.poly1d([1.0, -law.leak]) ** law.integrators * late + zero).roots
     for pole in expected[np.abs(expected) > 1e-3]:
         assert np.min(np.abs(design.poles - pole)) < 1e-6
@@ -158,23 +128,24 @@ def test_a_double_integrator_is_stable_where_its_zero_leads_more_than_the_delay_
 def test_the_best_gain_within_a_demand():
     air = ARModel(coefficients=[0.999], driving_rms_nm=30, frame_rate_hz=RATE)
     truth = lbt.Truth(turbulence=air, noise_nm=1.0)
-    free, bound, easy = (
-        integrator(PATH, truth=truth, law=IntegratorLaw(phase_margin_deg=demand))
-        for demand in (None, 50, 5)
-    )
-    assert bound.gain < free.gain
-    assert bound.gain == pytest.approx(2 * np.sin(np.radians(40 / 3)), rel=1e-5)
-    assert bound.solver.status == "limited by the margin demanded"
+    laws = (IntegratorLaw(phase_margin_deg=demand) for demand in (None, 50, 5))
+    free, bound, easy = (integrator(PATH, truth=truth, law=law) for law in laws)
+    assert free.gain > bound.gain == pytest.approx(2 * np.sin(np.radians(40 / 3)), rel=1e-5)
     assert easy.gain == pytest.approx(free.gain, rel=1e-5)
-    assert easy.solver.status == "least residual"
+    status = [design.solver.status for design in (bound, easy)]
+    assert status == ["limited by the margin demanded", "least residual"]
 
 
 def test_refusals():
-    def designed(gain=None, truth=None, **law):
-        return lambda: integrator(PATH, gain=gain, truth=truth, law=IntegratorLaw(**law))
+    def designed(gain=None, truth=None, path=PATH, **law):
+        return lambda: integrator(path, gain=gain, truth=truth, law=IntegratorLaw(**law))
 
     still = lbt.Truth(turbulence=None, noise_nm=0.0)
-    half = "zero_hz must be below half the frame rate"
+    two = lbt.Truth(turbulence=[SLOW, QUICK], noise_nm=5.0)
+    noisy = lbt.Truth(turbulence=SLOW, noise_nm=[5, 5])
+    modes, measurements = r"one per mode \(1\); got 2", r"one per measurement \(1\); got 2"
+    run = partial(lbt.simulate, designed(0.4)(), two, hardware=PATH, frames=9)
+    facts = {"frame_rate_hz": RATE, "turbulence": SLOW, "noise_nm": [1.0]}
     require_refusals(
         [
             (designed(1.01), CertificateError, "spectral radius of the closed loop"),
@@ -182,7 +153,7 @@ def test_refusals():
             (designed(0.0), ProblemError, "gain must be above 0"),
             (designed(phase_margin_deg=95), InfeasibleError, "no gain keeps phase_margin_deg 95"),
             (designed(), ProblemError, "a gain, a truth or a demand; got none"),
-            (designed(0.1, zero_hz=400), ProblemError, half),
+            (designed(0.1, zero_hz=400), ProblemError, "zero_hz must be below half the frame rate"),
             (designed(0.55, phase_margin_deg=45), CertificateError, "phase margin demanded over"),
             (designed(leak=1.01), ProblemError, "leak"),
             (designed(integrators=3), ProblemError, "integrators"),
@@ -190,7 +161,12 @@ def test_refusals():
             (designed(truth=still), ProblemError, "must disturb the loop"),
             (designed(truth=PATH), ProblemError, "truth must be a Truth; got LoopHardware"),
             (designed(0.1, truth=still), ProblemError, "a gain or a truth; got both"),
-            (lambda: integrator(3, gain=0.1), ProblemError, "hardware must be a LoopHardware"),
+            (designed(0.1, path=3), ProblemError, "hardware must be a LoopHardware"),
+            (designed(truth=two), DimensionError, modes),
+            (designed(truth=noisy), DimensionError, measurements),
+            (lambda: lbt.loop.least_residual(PATH, two), DimensionError, modes),
+            (run, DimensionError, modes),
+            (lambda: lbt.tip_tilt_plant(**facts), DimensionError, "measurement"),
         ]
     )
     assert designed(0.5, phase_margin_deg=45)().certificate.passed
@@ -202,6 +178,6 @@ def test_a_gain_file_keeps_the_law_and_its_claim(tmp_path):
     loaded = lbt.load_gain(lbt.save_gain(tmp_path / "double.npz", design))
     assert (loaded.law, loaded.gain) == (law, design.gain)
     assert len(loaded.certificate.checks) == 2
-    bold = dataclasses.replace(design, claims={**design.claims, "modulus_margin": 0.6})
+    bold = replace(design, claims=design.claims | {"modulus_margin": 0.6})
     with pytest.raises(lbt.errors.GainFileError, match="modulus margin demanded over achieved"):
         lbt.load_gain(lbt.save_gain(tmp_path / "bold.npz", bold))

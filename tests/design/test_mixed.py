@@ -1,6 +1,6 @@
 """Mixed filters: bounds that hold, and nothing better to be found."""
 
-import itertools
+from unittest.mock import Mock
 
 import clarabel
 import numpy as np
@@ -8,68 +8,62 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
-from support.plants import LBT_YAML, lbt_axis_plant, random_problem
+from support.plants import lbt_axis_plant, random_problem
 from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.design.mixed import central_filter
 from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
-from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 @pytest.fixture(scope="module")
-def plant():
-    return lbt_axis_plant()
-
-
-@pytest.fixture(scope="module")
-def ends(plant):
-    return lbt.hinf(plant, route="riccati"), lbt.kalman(plant)
+def ends():
+    plant = lbt_axis_plant()
+    return plant, lbt.hinf(plant, route="riccati"), lbt.kalman(plant)
 
 
 @pytest.mark.parametrize("ratio", [1.01, 1.1])
-def test_less_variance_than_the_central_filter_of_the_same_norm(plant, ends, ratio):
-    bound = ratio * ends[0].gamma_least
-    best, central = lbt.mixed(plant, gamma=bound), central_filter(plant, gamma=bound)
-    assert best.gamma == pytest.approx(bound, rel=1e-6)
-    assert central.gamma == pytest.approx(bound, rel=1e-6)
-    assert ends[1].rms < best.rms < central.rms
+def test_less_variance_than_the_central_filter_of_the_same_norm(ends, ratio):
+    plant, least, kalman = ends
+    bound = ratio * least.gamma_least
+    best, central = (make(plant, gamma=bound) for make in (lbt.mixed, central_filter))
+    assert (best.gamma, central.gamma) == pytest.approx((bound, bound), rel=1e-6)
+    assert kalman.rms < best.rms < central.rms
     assert best.method == "mixed"
     assert lbt.mixed(plant, gamma_ratio=ratio).rms == pytest.approx(best.rms, rel=1e-7)
 
 
-def test_the_ends_of_the_front(plant, ends):
-    least, kalman = ends
+def test_the_ends_of_the_front(ends):
+    plant, least, kalman = ends
     for make in (lbt.mixed, central_filter):
         assert make(plant, gamma=2 * kalman.gamma).rms == pytest.approx(kalman.rms, rel=1e-9)
     assert lbt.mixed(plant, gamma_ratio=1).gamma == pytest.approx(least.gamma, rel=1e-9)
 
 
-def test_more_taps_never_do_worse_and_converge(plant, ends):
-    bound = 1.05 * ends[0].gamma_least
-    rms = [lbt.mixed(plant, gamma=bound, taps=taps).rms for taps in (1, 4, 12, 16)]
-    assert all(more <= fewer * (1 + 1e-7) for fewer, more in itertools.pairwise(rms))
+def test_more_taps_never_do_worse_and_converge(ends):
+    plant, least, _ = ends
+    bound = 1.05 * least.gamma_least
+    rms = np.array([lbt.mixed(plant, gamma=bound, taps=taps).rms for taps in (1, 4, 12, 16)])
+    assert np.all(rms[1:] <= rms[:-1] * (1 + 1e-7))
     assert rms[2] / rms[3] - 1 < 2e-4
 
 
-def test_no_gain_of_the_plants_own_order_does_better(plant, ends):
+def test_no_gain_of_the_plants_own_order_does_better(ends):
     """An independent search over all predictor gains, not convex, ends above."""
-    bound = 1.05 * ends[0].gamma_least
+    plant, least, _ = ends
+    bound = 1.05 * least.gamma_least
     start = central_filter(plant, gamma=bound).gain_predictor
 
-    def error(x):
+    def judged(x, measure, otherwise):
         system = plant.error_system(start * x[:, None])
-        return system, system.spectral_radius < 1
+        return measure(system) if system.spectral_radius < 1 else otherwise
 
     def variance(x):
-        system, stable = error(x)
-        P = stationary_covariance(system.A, system.B @ system.B.T) if stable else None
-        return float(np.trace(plant.L @ P @ plant.L.T)) / 1e4 if stable else 1e8
+        return judged(x, lambda system: np.trace(system.output_covariances()[0]) / 1e4, 1e8)
 
     def room(x):
-        system, stable = error(x)
-        return (bound - float(lbt.hinf_norm(system))) / 100 if stable else -10.0
+        return judged(x, lambda system: (bound - float(lbt.hinf_norm(system))) / 100, -10.0)
 
     one, above = np.ones(len(start)), {"type": "ineq", "fun": room}
     options = {"maxiter": 40, "ftol": 1e-6, "eps": 1e-6}
@@ -91,21 +85,21 @@ def test_bounds_hold_on_any_problem(seed, n, q, l):
     assert design.recertify().passed
 
 
-def test_what_it_leaves_in_its_model(plant):
-    design = lbt.mixed(plant, gamma_ratio=1.1, taps=8)
-    assert design.problem.n_states == plant.n_states + 8
+def test_what_it_leaves_in_its_model(ends):
+    design = lbt.mixed(ends[0], gamma_ratio=1.1, taps=8)
+    assert design.problem.n_states == ends[0].n_states + 8
     loop = lbt.close_loop(design.hardware, design.controller)
-    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
-    budget = lbt.residual_budget(loop, truth, frame_means=True)
-    assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
+    rms_nm = lbt.residual_budget(loop, ends[0], frame_means=True).rms_nm
+    assert rms_nm == pytest.approx(design.rms, rel=1e-9)
 
 
-def test_refusals(plant):
+def test_refusals(ends):
     def mixed(**options):
         return lambda: lbt.mixed(plant, **options)
 
+    plant, two = ends[0], lbt_axis_plant(modes=2)
     memory = lbt.mixed(plant, gamma_ratio=1.1, taps=4).problem
-    two, taps, again = lbt_axis_plant(modes=2), np.ones((2, 3)), "holds the memory of a mixed"
+    taps, again = np.ones((2, 3)), "holds the memory of a mixed"
     require_refusals(
         [
             (mixed(), ProblemError, "give one of gamma and gamma_ratio"),
@@ -123,22 +117,16 @@ def test_refusals(plant):
     )
 
 
-class PanicException(BaseException):
-    """What the compiled solver raises, by its name."""
-
-
 def test_a_solver_that_panics_is_an_error_of_ours(monkeypatch):
-    def panic(*arguments, **options):
-        raise PanicException("out of range")
-
-    monkeypatch.setattr(clarabel, "DefaultSolver", panic)
+    panic = type("PanicException", (BaseException,), {})  # what the compiled solver raises
+    monkeypatch.setattr(clarabel, "DefaultSolver", Mock(side_effect=panic("out of range")))
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     with pytest.raises(NumericalError, match="numbers out of its range"):
         lbt.hinf(walk, route="lmi")
     assert lbt.hinf(walk).solver.route == "riccati"  # which takes over where the LMI fails
 
 
-def test_close_to_the_least_norm_of_two_axes():
+def test_close_to_the_least_norm_of_two_axes(config):
     """Where the conic solver loses its accuracy with its own scaling, the next setting is tried."""
-    design = lbt.mixed(lbt.load_config(LBT_YAML).plant, gamma_ratio=1.0012)
+    design = lbt.mixed(config.plant, gamma_ratio=1.0012)
     assert design.gamma <= 1.0012 * design.gamma_least * (1 + 1e-6)

@@ -1,5 +1,8 @@
 """Records of designs: each claim and each array counts, and what is altered is refused."""
 
+from functools import reduce
+from operator import getitem
+
 import numpy as np
 import pytest
 from support.gain_files import ORIGINALS, edited_file, original
@@ -12,38 +15,28 @@ from lbt_synth.files.gain_file.store import require_agreement
 FACTOR = 1.001
 
 
-def set_meta(*keys, value):
-    def change(document):
-        place = document["meta"]
-        for key in keys[:-1]:
-            place = place[key]
-        place[keys[-1]] = value
-
-    return change
-
-
-def read_too_early(document):
-    document["arrays"]["GAIN_PREDICTOR"][1][0][2] = 1e-3  # the slow sensor is not due at phase 1
-
-
 @pytest.mark.parametrize(
-    "change",
+    ("path", "value"),
     [
-        set_meta("sensors", 0, "noise_nm", value=10.0),
-        set_meta("sensors", 0, "delay_frames", value=3.0),
-        set_meta("sensors", 1, "highpass_hz", value=2.0),
-        set_meta("sensors", 1, "kind", value="thermometer"),
-        set_meta("motions", 0, "m1", "size", value=1.9),
-        set_meta("motions", 0, value={}),
-        set_meta("fallbacks", 0, value=["m1"]),
-        set_meta("vibrations", 0, "frequency_hz", value=21.0),
-        set_meta("frame_rate_hz", value=999.0),
-        set_meta("method", value="integrator"),
-        read_too_early,
+        (("sensors", 0, "noise_nm"), 10.0),
+        (("sensors", 0, "delay_frames"), 3.0),
+        (("sensors", 1, "highpass_hz"), 2.0),
+        (("sensors", 1, "kind"), "thermometer"),
+        (("motions", 0, "m1", "size"), 1.9),
+        (("motions", 0), {}),
+        (("fallbacks", 0), ["m1"]),
+        (("vibrations", 0, "frequency_hz"), 21.0),
+        (("frame_rate_hz",), 999.0),
+        (("method",), "integrator"),
+        (("GAIN_PREDICTOR", 1, 0, 2), 1e-3),  # the slow sensor is not due at phase 1
     ],
 )
-def test_an_altered_file_is_refused(sensors_design, tmp_path, change):
-    words = "GAIN_PREDICTOR is not what" if change is read_too_early else None
+def test_an_altered_file_is_refused(sensors_design, tmp_path, path, value):
+    def change(document):
+        reduce(getitem, path[:-1], document["arrays"] | document["meta"])[path[-1]] = value
+        document["meta"] |= {path[0]: value} if len(path) == 1 else {}
+
+    words = "GAIN_PREDICTOR is not what" if path[0] == "GAIN_PREDICTOR" else None
     with pytest.raises(GainFileError, match=words):
         lbt.load_gain(edited_file(tmp_path / "sensors.npz", sensors_design, change))
 
@@ -63,13 +56,14 @@ def test_each_claim_and_each_array_counts(name):
     """Times 1.001, a named check fails, or the file contradicts itself."""
     design = original(name)
     record = record_design(design)
+    arrays, meta, claims = record.arrays, record.meta, record.meta["claims"]
     assert complaint(design, record) == ""
-    for key, array in record.arrays.items():
+    for key, array in arrays.items():
         if np.any(array):
-            changed = DesignRecord({**record.arrays, key: FACTOR * array}, record.meta)
+            changed = DesignRecord({**arrays, key: FACTOR * array}, meta)
             assert complaint(design, changed), key
-    assert record.meta["claims"]
-    for key, value in record.meta["claims"].items():
+    assert claims
+    for key, value in claims.items():
         more = [FACTOR * part for part in value] if isinstance(value, list) else FACTOR * value
-        meta = {**record.meta, "claims": {**record.meta["claims"], key: more}}
-        assert complaint(design, DesignRecord(record.arrays, meta)), key
+        changed = DesignRecord(arrays, {**meta, "claims": {**claims, key: more}})
+        assert complaint(design, changed), key

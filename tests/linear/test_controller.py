@@ -1,26 +1,25 @@
 """Controllers as estimators that are given the applied commands."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
-from support.episodes import Episodes, frames_to_come_back
 from support.exports import lbt_config, turn_states
+from support.refusals import refused, require_refusals
+from support.shaping import ONE, shaped
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError
 from lbt_synth.linear import estimator_form
+from lbt_synth.loop.simulation import settling_frames
+from lbt_synth.loop.stable_range import affine_radii, parts_by_gain
 
 PATH = lbt.LoopHardware(frame_rate_hz=800)
 
 
-def law(**changes):
-    return lbt.integrator(PATH, gain=0.3, law=lbt.design.IntegratorLaw(**changes))
-
-
-def shaped(delay):
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=delay)
-    air = lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0)
-    spec = lbt.design.shaping.Specification(terms=[air])
-    return lbt.design.shape(path, spec, functions=8, states=None)
+def law(path=PATH, **changes):
+    return lbt.integrator(path, gain=0.3, law=lbt.design.IntegratorLaw(**changes))
 
 
 DESIGNS = {
@@ -32,8 +31,9 @@ DESIGNS = {
     "leak": lambda: law(leak=0.98),
     "zero": lambda: law(zero_hz=20.0),
     "two": lambda: law(integrators=2, zero_hz=20.0),
-    "fast": lambda: shaped(1),  # a command that acts on the next measurement
-    "late": lambda: shaped(2.4),
+    # a command that acts on the next measurement
+    "fast": lambda: shaped(path=replace(ONE, delay_frames=1), functions=8),
+    "late": lambda: shaped(path=replace(ONE, delay_frames=2.4), functions=8),
 }
 
 
@@ -46,19 +46,16 @@ def test_it_is_the_same_controller_where_its_commands_are_applied(name):
     last = np.zeros(len(controller.C))
     for y in np.random.default_rng(0).standard_normal((30, controller.B.shape[1])):
         u, last, alone = plain.step(y), given.step(y, last), own.step(y)
-        size = np.max(np.abs(u))
-        assert np.allclose(last, u, rtol=0, atol=1e-10 * size)
+        assert np.allclose(last, u, rtol=0, atol=1e-10 * np.max(np.abs(u)))
         assert np.array_equal(alone, last)
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "fast", "late"])
 def test_an_estimator_does_not_see_whether_its_commands_are_applied(name):
     """Measurements of a loop whose mirror does anything: the estimate is that of another one."""
-    design = DESIGNS[name]()
-    hardware, form = design.hardware, estimator_form(design)
-    rng = np.random.default_rng(1)
+    design, rng = DESIGNS[name](), np.random.default_rng(1)
+    hardware, form, last = design.hardware, estimator_form(design), []
     total = np.cumsum(rng.standard_normal((60, hardware.modes)), axis=0)
-    found = []
     for mirror in (0.0, 1.0):
         run, residual = form.start(), np.zeros(hardware.modes)
         past = np.zeros((len(hardware.mirror_taps), hardware.n_commands))
@@ -66,33 +63,33 @@ def test_an_estimator_does_not_see_whether_its_commands_are_applied(name):
             u = run.step(hardware.sensor @ residual, past[0])
             past = np.vstack([mirror * rng.standard_normal(u.shape), past[:-1]])
             residual = phase - hardware.influence @ (hardware.mirror_taps @ past)
-        found.append(u)
-    assert np.allclose(*found, rtol=0, atol=1e-9 * np.max(np.abs(found)))
+        last.append(u)
+    assert np.allclose(*last, rtol=0, atol=1e-9 * np.max(np.abs(last)))
 
 
 def test_what_is_left_of_a_conditioned_controller_are_its_zeros():
-    form = estimator_form(law(zero_hz=20.0))
+    form, pure = estimator_form(law(zero_hz=20.0)), estimator_form(law())
     assert form.spectral_radius == pytest.approx(np.exp(-2 * np.pi * 20 / 800), rel=1e-12)
-    pure = estimator_form(law())
     assert not pure.A.any()
     assert np.array_equal(pure.applied, np.eye(2))  # u(k) = u_applied(k-1) + g y(k)
-    both = lbt.LoopHardware(frame_rate_hz=800, modes=1, influence_matrix=[[0.5, 0.5]])
-    leaky = lbt.integrator(both, gain=0.3, law=lbt.design.IntegratorLaw(leak=0.98))
     # two actuators of one mode: what no measurement sees leaks as before
-    assert estimator_form(leaky).spectral_radius == pytest.approx(0.98, rel=1e-12)
+    both = lbt.LoopHardware(frame_rate_hz=800, modes=1, influence_matrix=[[0.5, 0.5]])
+    assert estimator_form(law(both, leak=0.98)).spectral_radius == pytest.approx(0.98, rel=1e-12)
 
 
-def test_a_controller_without_such_a_form_is_refused():
-    late = lbt.Controller(A=[[0, 0], [1, 1.0]], B=[[1], [0]], C=[[0, 1]], D=[[0]])
-    with pytest.raises(lbt.errors.NumericalError, match="a pole of modulus 1, a zero"):
-        estimator_form(late)
+def test_refusals():
+    late = lbt.Controller(A=[[0, 0], [1, 1.0]], B=[[1], [0]], C=[[0, 1]], D=0)
     # z (z - 2) / (z - 1)^2
-    outside = lbt.Controller(A=[[2, -1], [1, 0]], B=[[1], [0]], C=[[1, -2.0]], D=[[0]])
-    with pytest.raises(lbt.errors.NumericalError, match="a pole of modulus 2, a zero") as refused:
-        estimator_form(outside)
-    assert refused.value.residual == pytest.approx(2)
-    with pytest.raises(lbt.errors.DimensionError, match="applied must have"):
-        lbt.Controller(A=[[0.5]], B=[[1]], C=[[1]], D=[[0]], applied=np.ones((2, 1)))
+    outside = lbt.Controller(A=[[2, -1], [1, 0]], B=[[1], [0]], C=[[1, -2.0]], D=0)
+    parts, run = {"A": 0.5, "B": 1, "C": 1, "D": 0}, estimator_form(law()).start()
+    rows = [
+        (lambda: estimator_form(late), NumericalError, "a pole of modulus 1, a zero"),
+        (lambda: estimator_form(outside), NumericalError, "a pole of modulus 2, a zero"),
+        (lambda: lbt.Controller(**parts, applied=np.ones((2, 1))), DimensionError, "applied must"),
+        (lambda: run.step([1, 2], [0]), DimensionError, "applied must have shape"),
+    ]
+    require_refusals(rows)
+    assert refused(*rows[1]).residual == pytest.approx(2)
 
 
 def test_inputs_that_are_not_finite_leave_the_state():
@@ -101,40 +98,96 @@ def test_inputs_that_are_not_finite_leave_the_state():
     plain.step([1.0, 2.0])
     states = run.state.copy(), plain.state.copy()
     for bad in (np.nan, np.inf, -np.inf):
-        for step in (
-            lambda b=bad: run.step([b, 0], [0, 0]),
-            lambda b=bad: run.step([0, 0], [b, 0]),
-            lambda b=bad: plain.step([0, b]),
+        for step, *inputs in (
+            (run.step, [bad, 0], [0, 0]),
+            (run.step, [0, 0], [bad, 0]),
+            (plain.step, [0, bad]),
         ):
-            with pytest.raises(lbt.errors.NonFiniteError, match="Hold the last command"):
-                step()
-    assert np.array_equal(run.state, states[0])
-    assert np.array_equal(plain.state, states[1])
+            refused(partial(step, *inputs), NonFiniteError, "Hold the last command")
+    assert np.array_equal(states, (run.state, plain.state))
     plain.reset()
     assert not plain.state.any()
-    with pytest.raises(lbt.errors.DimensionError, match="applied must have shape"):
-        run.step([1.0, 2.0], [0.0])
 
 
 def test_a_mirror_that_stops_short_winds_up_the_plain_form_alone():
     config, design = lbt_config(), DESIGNS["kalman"]()
-    known = {"hardware": config.hardware, "frames": 1200, "seed": 3, "settle_frames": 0}
+    facts = {"frames": 1200, "seed": 3, "settle_frames": 0, "stroke": 1200.0}
     plain, given = (
-        lbt.simulate(form, config.truth, **known, stroke=1200.0)
+        lbt.simulate(form, config.truth, hardware=config.hardware, **facts)
         for form in (design.controller, estimator_form(design))
     )
     assert np.max(np.abs(plain.commands)) == np.max(np.abs(given.commands)) == 1200
     assert plain.rms_nm[0] > 2 * given.rms_nm[0]
 
 
+QUIET, LONGEST = 200, 400  # frames before an episode, and of one at most
+TURBULENCE_NM, POLE, LINE_NM, LINE_HZ, NOISE_NM = 592.0, 0.9886, 797.0, 20.0, 15.5
+
+
+def disturbances(count, frames, dt_s):
+    """Frames of turbulence, a vibration of the first axis and noise, (count, 2) each."""
+    rng = np.random.default_rng(0)
+    air = TURBULENCE_NM * rng.standard_normal((count, 2))
+    phase = rng.uniform(0, 2 * np.pi, count)
+    for k in range(frames):
+        line = LINE_NM * np.sqrt(2) * np.sin(2 * np.pi * LINE_HZ * dt_s * k + phase)
+        yield air + line[:, None] * [1, 0], NOISE_NM * rng.standard_normal((count, 2))
+        kick = TURBULENCE_NM * np.sqrt(1 - POLE**2) * rng.standard_normal((count, 2))
+        air = POLE * air + kick
+
+
+class Run:
+    """Many loops of two frames' delay around one controller, in either form."""
+
+    def __init__(self, design, gains, *, given):
+        k, form = design.controller, estimator_form(design)
+        assert design.hardware.delay_frames == 2
+        assert not k.D.any()
+        rows = [form.A, form.B, form.applied] if given else [k.A, k.B, 0 * form.applied]
+        self.step_matrix, self.C, self.gains = np.hstack(rows).T, k.C.T, gains[:, None]
+        self.state = np.zeros((len(gains), k.n_states))
+        self.applied, self.residual = np.zeros((2, len(gains), 2))
+
+    def request(self, total, noise):
+        """Step all loops, and return the commands that they compute."""
+        y = self.gains * self.residual + noise
+        self.state = np.hstack([self.state, y, self.applied]) @ self.step_matrix
+        self.residual = total - self.applied  # the command of the frame before
+        return self.state @ self.C
+
+
 def back(name, count):
-    """Parts of the episodes after which a loop is back in time, in both forms."""
-    design = DESIGNS[name]()
-    episodes = Episodes.draw(design, count, np.random.default_rng(1), (0.7, 1.0))
-    return [
-        np.mean(frames_to_come_back(design, episodes, given=given) <= 2 * episodes.settling)
-        for given in (True, False)
-    ]
+    """Parts of the episodes after which a loop is back in time, in both forms.
+
+    For some frames its commands are clipped, not applied or held. It is back where its residual
+    stays within 1 % of the undisturbed one after twice the frames in which it settles to 1e-4.
+    """
+    design, rng = DESIGNS[name](), np.random.default_rng(1)
+    gains = np.sort(rng.uniform(0.7, 1.0, count))
+    radii = affine_radii(parts_by_gain(design.hardware, design.controller), gains)
+    settling = np.array([settling_frames(radius) for radius in radii])
+    kinds, ends = rng.integers(3, size=(count, 1)), QUIET + rng.integers(1, LONGEST, size=count)
+    depth = rng.uniform(0, 0.7, size=(count, 1))  # of clipping, as a part of the largest command
+    free, *runs = (Run(design, gains, given=given) for given in (True, True, False))
+    largest, power, away = np.zeros((count, 1)), np.zeros(count), np.zeros((2, count))
+    frames = QUIET + LONGEST + 3 * int(np.max(settling))
+    with np.errstate(all="ignore"):  # the plain form may grow beyond all numbers
+        for k, series in enumerate(disturbances(count, frames, design.hardware.dt_s)):
+            limit = 1.2 * np.maximum(largest, 3 * (TURBULENCE_NM + LINE_NM))
+            low = np.where(kinds == 0, depth * largest, 0.0)
+            inside = ((k >= QUIET) & (k < ends))[:, None]
+            free.applied = free.request(*series)
+            if k < QUIET:
+                largest = np.maximum(largest, np.max(np.abs(free.applied), axis=1, keepdims=True))
+            power += np.mean(free.residual**2, axis=1)
+            for i, run in enumerate(runs):
+                u = run.request(*series)
+                stopped = np.where(kinds == 2, run.applied, np.clip(u, -low, low))
+                run.applied = np.where(inside, stopped, np.clip(u, -limit, limit))
+                apart = np.max(np.abs(run.residual - free.residual), axis=1)
+                far = ~(apart <= 0.01 * np.sqrt(power / (k + 1)))
+                away[i] = np.where(far & (k >= ends), k + 1 - ends, away[i])
+    return np.mean(away <= 2 * settling, axis=1)
 
 
 def test_clipping_opening_and_holding_leave_nothing_behind():

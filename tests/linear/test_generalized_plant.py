@@ -3,7 +3,7 @@
 import control
 import numpy as np
 import pytest
-from support.generalized_plants import random_plant
+from support.generalized_plants import random_plant, sampled
 from support.refusals import require_refusals
 
 import lbt_synth as lbt
@@ -13,19 +13,13 @@ from lbt_synth.linear import GeneralizedPlant, StateSpace
 
 @pytest.mark.parametrize("seed", range(2))
 def test_closed_loop_is_the_fractional_transformation(seed):
-    plant = random_plant(seed, n=4)
-    _, controls, _, measurements = plant.sizes
-    P = GeneralizedPlant.of(plant.whole, measurements=measurements, controls=controls)
+    rng, P = np.random.default_rng(seed), random_plant(seed, n=4)
     m1, m2, p1, p2 = P.sizes
-    rng = np.random.default_rng(seed)
-    K = StateSpace(
-        A=0.3 * rng.normal(size=(3, 3)),
-        B=rng.normal(size=(3, p2)),
-        C=rng.normal(size=(m2, 3)),
-        D=0.1 * rng.normal(size=(m2, p2)),
-    )
+    P = GeneralizedPlant.of(P.whole, measurements=p2, controls=m2)
+    B, C, D = rng.normal(size=(3, p2)), rng.normal(size=(m2, 3)), 0.1 * rng.normal(size=(m2, p2))
+    K = StateSpace(A=0.3 * rng.normal(size=(3, 3)), B=B, C=C, D=D)
     frequency_hz = np.linspace(0.01, 0.5, 9)
-    G, Kf = P.whole.frequency_response(frequency_hz), K.frequency_response(frequency_hz)
+    G, Kf = (system.frequency_response(frequency_hz) for system in (P.whole, K))
     P11, P12, P21, P22 = (
         G[:, a, b] for a in (slice(p1), slice(p1, None)) for b in (slice(m1), slice(m1, None))
     )
@@ -38,8 +32,7 @@ def test_design_of_a_textbook_plant():
     """S. Skogestad's disturbance process (section 2.6.3): the norm stays near one."""
     G = control.tf([200.0], np.polymul([10.0, 1.0], np.polymul([0.05, 1.0], [0.05, 1.0])))
     W1 = control.tf([1 / 1.5, 10.0], [1.0, 10.0 * 1e-4])
-    G, W1 = (control.sample_system(control.ss(S), 0.1, method="bilinear") for S in (G, W1))
-    weighted = control.augw(G, W1, control.ss([], [], [], 1.0, 0.1))
+    weighted = control.augw(sampled(G, 0.1), sampled(W1, 0.1), control.ss([], [], [], 1.0, 0.1))
     design = lbt.hinf_controller(GeneralizedPlant.of(weighted, measurements=1, controls=1))
     assert design.gamma == pytest.approx(1.37, abs=0.01)  # the book's table says 1.37
 

@@ -11,6 +11,7 @@ import lbt_synth as lbt
 from lbt_synth.design.certificate import certify_infeasible
 from lbt_synth.errors import DimensionError, NonFiniteError
 from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 
 
 def test_the_witness_is_a_signal_that_no_measurement_shows(axis_plant):
@@ -18,14 +19,12 @@ def test_the_witness_is_a_signal_that_no_measurement_shows(axis_plant):
     p = axis_plant
     design = lbt.hinf(p, route="riccati")
     x, w = design.witness.states, design.witness.disturbances
-    size = np.linalg.norm(p.C, 2) * np.linalg.norm(x, 2) + np.linalg.norm(p.D, 2) * np.linalg.norm(
-        w, 2
-    )
+    size = sum(np.linalg.norm(a, 2) * np.linalg.norm(b, 2) for a, b in ((p.C, x), (p.D, w)))
     assert np.linalg.norm(p.C @ x + p.D @ w) < 1e-9 * size
     after = p.A @ x + p.B @ w
-    growth = after @ after.T - x @ x.T
-    scale = np.sqrt(np.outer(np.diag(after @ after.T), np.diag(after @ after.T)))
-    assert np.linalg.eigvalsh(growth / scale)[0] > -1e-9
+    scale = np.sqrt(np.diag(after @ after.T))
+    growth = (after @ after.T - x @ x.T) / np.outer(scale, scale)
+    assert np.linalg.eigvalsh(growth)[0] > -1e-9
     ratio = np.linalg.norm(p.L @ after) / np.linalg.norm(w)
     assert ratio == pytest.approx(design.gamma_infeasible, rel=1e-6)
 
@@ -36,7 +35,7 @@ def test_no_witness_proves_too_much(seed, n, r):
     """Whatever the pairs of states and disturbances, the level stays below the norm of a filter."""
     rng = np.random.default_rng(seed)
     problem = random_problem(rng, n)
-    covariance = lbt.solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R, problem.S).X
+    covariance = kalman_riccati(problem).P
     states = rng.standard_normal((n, r)) * rng.choice([0.0, 1e-3, 1.0])
     disturbances = rng.standard_normal((problem.B.shape[1], r))
     witness = Witness(states=states, disturbances=disturbances)
@@ -46,18 +45,16 @@ def test_no_witness_proves_too_much(seed, n, r):
 
 def test_states_without_error_prove_nothing():
     """A direction in which no filter errs has no price: a witness that uses it is worth nothing."""
-    p = lbt.EstimationProblem(
-        A=np.diag([0.9, 0.5]), B=[[1, 0], [0, 0]], C=[[1, 0]], D=[[0, 1]], L=[[1, 1]]
-    )
+    parts = {"A": np.diag([0.9, 0.5]), "B": [[1, 0], [0, 0]], "C": [[1, 0]], "D": [[0, 1]]}
+    p = lbt.EstimationProblem(**parts, L=[[1, 1]])
     free = Witness(states=[[0.0], [1.0]], disturbances=[[1e-6], [0.0]])
     assert not certify_infeasible(p, 1e5, free).passed
     least = lbt.hinf(p, route="riccati").gamma_least
     assert least == pytest.approx(1.34536, abs=1e-5)
     extended = lbt.mixed(p, gamma_ratio=1.01, taps=3).problem
-    memory = np.eye(extended.n_states)[:, -2:]
-    assert not certify_infeasible(
-        extended, 1.1 * least, Witness(states=memory, disturbances=1e-6 * np.ones((2, 2)))
-    ).passed
+    states, disturbances = np.eye(extended.n_states)[:, -2:], 1e-6 * np.ones((2, 2))
+    memory = Witness(states=states, disturbances=disturbances)
+    assert not certify_infeasible(extended, 1.1 * least, memory).passed
 
 
 def test_refusals(axis_plant):
@@ -68,8 +65,7 @@ def test_refusals(axis_plant):
         return Witness(states=np.ones(sizes[0]), disturbances=np.ones(sizes[1]))
 
     assert witness((1, 4, 1), (1, 3, 1)).states.shape == (4, 1)
-    three = witness((3, 1), (3, 1))
-    nothing = {"states": [[np.nan]], "disturbances": [[1.0]]}
+    three, nothing = witness((3, 1), (3, 1)), {"states": [[np.nan]], "disturbances": [[1.0]]}
     rows = [
         (lambda: witness(2, 2), DimensionError, "states must be a matrix"),
         (lambda: witness((3, 3), (2, 2)), DimensionError, "must have 3 columns"),

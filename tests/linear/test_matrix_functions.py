@@ -27,12 +27,11 @@ def test_the_schur_form_gives_back_the_matrix(monkeypatch, fails):
         return scipy.linalg.schur(A, output=output)
 
     monkeypatch.setattr(matrix_functions, "schur", stubborn)
-    rng = np.random.default_rng(0)
-    shift = np.eye(6, k=-1)
-    for A in (rng.standard_normal((7, 7)), shift, shift + np.eye(6, k=5)):
-        T, U = matrix_functions.complex_schur(A)
-        assert U @ T @ U.conj().T == pytest.approx(A, abs=1e-12)
-        assert U @ U.conj().T == pytest.approx(np.eye(len(A)), abs=1e-12)
+    shift, A = np.eye(6, k=-1), np.random.default_rng(0).standard_normal((7, 7))
+    for matrix in (A, shift, shift + np.eye(6, k=5)):
+        T, U = matrix_functions.complex_schur(matrix)
+        assert U @ T @ U.conj().T == pytest.approx(matrix, abs=1e-12)
+        assert U @ U.conj().T == pytest.approx(np.eye(len(matrix)), abs=1e-12)
         assert not np.tril(T, -1).any()
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.limits import RATE, Anonymous, ar, path
+from support.limits import RATE, Anonymous, ar, path, variance
 from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
@@ -14,35 +14,30 @@ from lbt_synth.loop.band_limit import least_worst_residual
 
 
 def test_band_of_the_example(config):
-    line = config.truth.vibrations[0]
-    limit = least_worst_residual(
-        config.hardware, config.truth, band_hz=(16.5, 23.5), rms_nm=line.rms_nm, frame_means=True
-    )
-    assert limit.rms_nm == pytest.approx(15.1088, abs=1e-4)
-    assert limit.rms_nm <= limit.achieved_nm < limit.rms_nm * (1 + 1e-8)
-    assert limit.weight.sum() == pytest.approx(1)
-    assert limit.weight.min() >= 0
-    assert 16.5 < limit.frequency_hz.min() < limit.frequency_hz.max() < 23.5
+    line, hardware, truth = config.truth.vibrations[0], config.hardware, config.truth
+    band = {"band_hz": (16.5, 23.5), "rms_nm": line.rms_nm}
+    means = least_worst_residual(hardware, truth, **band, frame_means=True)
+    image = least_worst_residual(hardware, truth, **band)
+    assert means.rms_nm == pytest.approx(15.1088, abs=1e-4)
+    assert means.rms_nm <= means.achieved_nm < means.rms_nm * (1 + 1e-8)
+    assert means.weight.sum() == pytest.approx(1)
+    assert means.weight.min() >= 0
+    assert 16.5 < means.frequency_hz.min() < means.frequency_hz.max() < 23.5
     # in the image no loop leaves less than the motion within a frame at the upper end
-    known = lbt.loop.least_residual(config.hardware, replace(config.truth, vibrations=()))
+    still = lbt.loop.least_residual(hardware, replace(truth, vibrations=()))
     floor = line.rms_nm**2 * (1 - np.sinc(23.5 / RATE) ** 2)
-    own = line.rms_nm**2 * (1 - np.sinc(line.frequency_hz / RATE) ** 2)  # of the truth's own line
-    moving = least_worst_residual(
-        config.hardware, config.truth, band_hz=(16.5, 23.5), rms_nm=line.rms_nm
-    )
-    assert moving.rms_nm**2 == pytest.approx(known.rms_nm**2 + floor + own)
+    floor += line.rms_nm**2 * (1 - np.sinc(line.frequency_hz / RATE) ** 2)  # of the truth's line
+    assert image.rms_nm**2 == pytest.approx(still.rms_nm**2 + floor)
     # what rejects the means leaves little more: their own limit takes the place of no line at all
-    within = floor + own + known.within_nm2.sum()
-    assert moving.achieved_nm**2 == pytest.approx(limit.rms_nm**2 + within, rel=1e-3)
-    assert moving.rms_nm < moving.achieved_nm
+    within = floor + still.within_nm2.sum()
+    assert image.achieved_nm**2 == pytest.approx(means.rms_nm**2 + within, rel=1e-3)
+    assert image.rms_nm < image.achieved_nm
 
 
 def test_the_density_found_is_the_hardest(config):
     """Its Wiener limit, as a table of its own, is the band limit; the flat one is below."""
-    hardware, still = config.hardware, replace(config.truth, vibrations=())
-    limit = least_worst_residual(
-        hardware, still, band_hz=(10.0, 40.0), rms_nm=5.0, frame_means=True
-    )
+    still, band = replace(config.truth, vibrations=()), {"band_hz": (10.0, 40.0), "rms_nm": 5.0}
+    limit = least_worst_residual(config.hardware, still, **band, frame_means=True)
     edges = np.linspace(10, 40, 61)
     share = np.histogram(limit.frequency_hz, edges, weights=limit.weight)[0]
     assert not np.allclose(share, 1 / 60, rtol=0.01)
@@ -55,9 +50,7 @@ def test_the_density_found_is_the_hardest(config):
 
         spectrum = Anonymous(psd)
         spectrum.breakpoints_hz = edges
-        one = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-        flat = replace(still, turbulence=spectrum)
-        own = lbt.loop.least_residual(one, flat, frame_means=True).variance_nm2[0]
+        own = variance(path(), turbulence=spectrum, noise_nm=still.noise_nm)
         return np.sqrt(own + limit.variance_nm2[1])
 
     hardest, flat = of_density(share), of_density(np.full(60, 1 / 60))
@@ -69,14 +62,9 @@ def test_the_density_found_is_the_hardest(config):
 def test_a_controller_reaches_the_band_limit(delay):
     still = lbt.Truth(turbulence=ar(0.9886, driving=89.0), noise_nm=15.5)
     band = {"band_hz": (17, 23), "rms_nm": 500, "direction": (1,)}
-    means = least_worst_residual(path(delay), still, **band, frame_means=True)
-    assert means.rms_nm <= means.achieved_nm < means.rms_nm * (1 + 1e-7)
-    if delay % 1:
-        with pytest.raises(lbt.errors.ProblemError, match="known for whole frames of delay"):
-            least_worst_residual(path(delay), still, **band)
-    else:
-        image = least_worst_residual(path(delay), still, **band)
-        assert image.rms_nm <= image.achieved_nm < image.rms_nm * 1.02
+    for frame_means, apart in ((True, 1e-7), (False, 0.02))[: 1 if delay % 1 else 2]:
+        limit = least_worst_residual(path(delay), still, **band, frame_means=frame_means)
+        assert limit.rms_nm <= limit.achieved_nm < limit.rms_nm * (1 + apart)
 
 
 def test_a_narrow_band_tends_to_the_known_frequency():
@@ -98,9 +86,10 @@ def test_bad_bands_and_a_search_that_does_not_settle(monkeypatch):
     still = lbt.Truth(turbulence=ar(0.9), noise_nm=1.0)
     good = {"truth": still, "band_hz": (15, 25), "rms_nm": 10, "direction": (1,)}
 
-    def limit(**changes):
-        return lambda: least_worst_residual(path(3), **(good | changes))
+    def limit(delay=3, **changes):
+        return lambda: least_worst_residual(path(delay), **(good | changes))
 
+    silent, noise = lbt.Truth(turbulence=ar(0.9)), "noise on all measurements must be positive def"
     rows = [
         (limit(band_hz=(25, 20)), ProblemError, "must increase"),
         (limit(band_hz=(20, 20)), ProblemError, "For a known frequency"),
@@ -108,11 +97,8 @@ def test_bad_bands_and_a_search_that_does_not_settle(monkeypatch):
         (limit(band_hz=(0, 20)), ProblemError, "between 0 and"),
         (limit(direction=(1, 0)), ProblemError, "must have 1 components"),
         (limit(direction=(0,)), ProblemError, "not zero"),
-        (
-            limit(truth=lbt.Truth(turbulence=ar(0.9))),
-            ProblemError,
-            "noise on all measurements must be positive definite",
-        ),
+        (limit(truth=silent), ProblemError, noise),
+        (limit(2.4), ProblemError, "known for whole frames of delay"),
     ]
     require_refusals(rows)
     monkeypatch.setattr(band_module, "_ROUNDS", 1)

@@ -1,6 +1,7 @@
 """Many loops at once: against each loop on its own, and what is refused."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import budget
 from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
 from lbt_synth.loop.evaluator import split_into_parts, textbook_matrices
@@ -17,166 +19,137 @@ from lbt_synth.models import ARModel, PositionLoop, SinusoidalVibration, SumSpec
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
 
 
-def ensemble_residuals(controller, hardware, ensemble, **facts):
-    matrices = textbook_matrices([controller])
-    return budget.ensemble_residuals(matrices, hardware, ensemble, **facts)
+SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
+TURN = 0.9 * np.array([[np.cos(np.pi / 6), -0.5], [0.5, np.cos(np.pi / 6)]])
+ASKEW = [replace(LINE, direction=(1, 2)), replace(LINE, frequency_hz=31, direction=(1, 0))]
+PLANTS = {
+    "kalman": {},
+    "coupled": {"sensor_matrix": TURN, "vibrations": ASKEW},  # no axis is independent
+    "uneven": {"vibrations": [LINE]},
+    "mirror": {"mirror": SHELL},
+}
 
 
-def ensemble_of(w, *, turbulence, direction=(1, 0.5)):
-    return LoopEnsemble(
-        sensor_gain=w["gains"],
-        delay_frames=w["delays"],
-        noise_nm=w["noise"],
-        turbulence=turbulence,
-        vibrations=[
-            EnsembleVibration(frequency_hz=w["frequency"], rms_nm=w["rms"], direction=direction),
-            EnsembleVibration(
-                frequency_hz=w["frequency"] + 10,
-                rms_nm=w["rms"],
-                damping=w["damping"],
-                direction=direction,
-            ),
-        ],
+@cache
+def designed(name):
+    return lbt.kalman(plant(**PLANTS[name]))
+
+
+def ensemble_residuals(design, ensemble, hardware=None, **facts):
+    matrices = textbook_matrices([as_controller(design)])
+    return budget.ensemble_residuals(matrices, hardware or design.hardware, ensemble, **facts)
+
+
+def ensemble_of(w, turbulence):
+    """Return loops that meet a line of known frequency, a resonance and a bump."""
+    f, facts = w["frequency"], {"rms_nm": w["rms"], "direction": (1, 0.5)}
+    lines = (
+        EnsembleVibration(frequency_hz=f, **facts),
+        EnsembleVibration(frequency_hz=f + 10, damping=w["damping"], **facts),
+        EnsembleVibration(frequency_hz=f + 20, damping=0.2, sections=3, **facts),
     )
+    facts = {"sensor_gain": w["gains"], "delay_frames": w["delays"], "noise_nm": w["noise"]}
+    return LoopEnsemble(**facts, turbulence=turbulence, vibrations=lines)
 
 
-def truth_of(w, i, turbulence, direction=(1, 0.5)):
-    f, rms = float(w["frequency"][i]), float(w["rms"][i])
-    return lbt.Truth(
-        turbulence=turbulence,
-        noise_nm=float(w["noise"][i]),
-        sensor_gain=float(w["gains"][i]),
-        vibrations=(
-            SinusoidalVibration(frequency_hz=f, rms_nm=rms, direction=direction),
-            lbt.Vibration(
-                frequency_hz=f + 10, rms_nm=rms, damping=float(w["damping"][i]), direction=direction
-            ),
-        ),
+def truth_of(w, i, turbulence):
+    one = {name: float(numbers[i]) for name, numbers in w.items()}
+    f, facts = one["frequency"], {"rms_nm": one["rms"], "direction": (1, 0.5)}
+    lines = (
+        SinusoidalVibration(frequency_hz=f, **facts),
+        lbt.Vibration(frequency_hz=f + 10, damping=one["damping"], **facts),
+        lbt.Vibration(frequency_hz=f + 20, damping=0.2, sections=3, **facts),
     )
+    facts = {"noise_nm": one["noise"], "sensor_gain": one["gains"]}
+    return lbt.Truth(turbulence=turbulence, vibrations=lines, **facts)
 
 
-def agree(found, design, w, turbulence_of, *, rel=5e-7):
-    """Hold each row against residual_budget of its own loop."""
-    strehls = lbt.strehl(found, CAMERA)
-    unstable = 0
-    for i in range(len(found.stable)):
+def agree(design, w, turbulence, turbulence_of, *, rel=5e-7):
+    """Hold each loop against residual_budget of its own; return how many are unstable."""
+    many = ensemble_residuals(design, ensemble_of(w, turbulence))
+    strehls = lbt.strehl(many, CAMERA)
+    # of a resonance, by quadrature where a hold is no frame
+    accuracies = {"turbulence_nm2": rel, "noise_nm2": rel, "random_vibration_nm2": 4 * rel}
+    for i in range(len(many.stable)):
         hardware = replace(design.hardware, delay_frames=float(w["delays"][i]))
         truth = truth_of(w, i, turbulence_of(i))
         loop = lbt.close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        assert found.stable[i] == loop.is_stable
+        assert many.stable[i] == loop.is_stable
         if not loop.is_stable:
-            unstable += 1
-            assert np.isnan([found.rms_nm[i], strehls[i], found.noise_nm[i]]).all()
+            assert np.isnan([many.rms_nm[i], strehls[i], many.noise_nm[i]]).all()
             continue
-        budget = lbt.residual_budget(loop, truth)
-        for mine, theirs, apart in (
-            (found.turbulence_nm2[i], budget.turbulence_nm2, rel),
-            (found.noise_nm2[i], budget.noise_nm2, rel),
-            # of a resonance, by quadrature where a hold is no frame
-            (found.random_vibration_nm2[i], budget.random_vibration_nm2, 4 * rel),
-            (found.within_nm2[i], budget.within_nm2, 4 * rel),
-        ):
+        one = lbt.residual_budget(loop, truth)
+        for name, apart in (accuracies | {"within_nm2": 4 * rel}).items():
+            mine, theirs = getattr(many, name)[i], getattr(one, name)
             assert np.max(np.abs(mine - theirs)) < apart * np.trace(theirs)
-        left = np.abs(found.line_amplitudes_nm[i] - budget.line_amplitudes_nm)
-        assert np.max(left) < 1e-9 * np.max(np.abs(budget.line_amplitudes_nm))
-        assert found.rms_nm[i] == pytest.approx(budget.rms_nm, rel=rel)
-        assert found.vibration_nm[i] == pytest.approx(budget.vibration_nm, rel=1e-9)
-        assert strehls[i] == pytest.approx(lbt.strehl(budget, CAMERA), abs=1e-6)
-    return unstable
+        left = np.abs(many.line_amplitudes_nm[i] - one.line_amplitudes_nm)
+        assert np.max(left) < 1e-9 * np.max(np.abs(one.line_amplitudes_nm))
+        assert many.rms_nm[i] == pytest.approx(one.rms_nm, rel=rel)
+        assert many.vibration_nm[i] == pytest.approx(one.vibration_nm, rel=1e-8)
+        assert strehls[i] == pytest.approx(lbt.strehl(one, CAMERA), abs=1e-6)
+    return np.count_nonzero(~many.stable)
 
 
-@pytest.mark.parametrize("which", ["kalman", "coupled"])
-def test_each_loop_on_its_own(which, request):
+@pytest.mark.parametrize("name", ["kalman", "coupled"])
+def test_each_loop_on_its_own(name):
     """One process for all loops, one a loop, frozen flows, and different ones of the two axes."""
-    design, w = request.getfixturevalue(which), weather(10, seed=1)
-    flows = replace(AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"])
+    design, w, rng = designed(name), weather(10, seed=1), np.random.default_rng(2)
+    winds = {"seeing_arcsec": w["seeing"], "wind_speed_m_s": w["wind"]}
+    poles, drive = rng.uniform(0.97, 0.995, 10), rng.uniform(20, 90, 10)
 
     def flow(i):
-        return replace(AIR, seeing_arcsec=w["seeing"][i], wind_speed_m_s=w["wind"][i])
+        return replace(AIR, **{name: numbers[i] for name, numbers in winds.items()})
 
-    rng = np.random.default_rng(2)
-    poles, drive = rng.uniform(0.97, 0.995, 10), rng.uniform(20, 90, 10)
-    each = ARModel(coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE)
+    def process(i):
+        return ARModel(coefficients=poles[i, None], driving_rms_nm=drive[i], frame_rate_hz=RATE)
 
-    def own(i):
-        return ARModel(coefficients=[poles[i]], driving_rms_nm=drive[i], frame_rate_hz=RATE)
-
-    for turbulence, single in (
+    processes = ARModel(coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE)
+    for turbulence, turbulence_of in (
         ((AIR, None), lambda i: (AIR, None)),
         (SLOW, lambda i: SLOW),
-        (flows, flow),
-        ((AIR, each), lambda i: (AIR, own(i))),
+        (replace(AIR, **winds), flow),
+        ((AIR, processes), lambda i: (AIR, process(i))),
     ):
-        ensemble = ensemble_of(w, turbulence=turbulence)
-        found = ensemble_residuals(design.controller, design.hardware, ensemble)
-        agree(found, design, w, single)
-    w["gains"] = np.linspace(0.2, 4, 10)
-    ensemble = ensemble_of(w, turbulence=SLOW)
-    found = ensemble_residuals(design.controller, design.hardware, ensemble)
-    assert agree(found, design, w, lambda i: SLOW) > 1
+        agree(design, w, turbulence, turbulence_of)
+    strong = w | {"gains": np.linspace(0.2, 4, 10)}
+    assert agree(design, strong, SLOW, lambda i: SLOW) > 1
 
 
-def test_a_bump_shakes_each_loop_as_it_shakes_one(kalman):
-    bump = lbt.Vibration(frequency_hz=40, damping=0.2, rms_nm=100, sections=3)
-    shaken = EnsembleVibration(frequency_hz=[40, 45], rms_nm=100, damping=0.2, sections=3)
-    ensemble = LoopEnsemble(turbulence=SLOW, vibrations=(shaken,), noise_nm=10)
-    left = ensemble_residuals(kalman.controller, kalman.hardware, ensemble).rms_nm
-    loop = lbt.close_loop(kalman.hardware, kalman.controller)
-    for frequency_hz, rms_nm in zip((40, 45), left, strict=True):
-        line = replace(bump, frequency_hz=frequency_hz)
-        truth = lbt.Truth(turbulence=SLOW, vibrations=(line,), noise_nm=10)
-        assert rms_nm == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-8)
-
-
-def test_a_mirror_with_dynamics(kalman):
-    shell = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
-    design = lbt.kalman(plant(mirror=shell))
-    w = weather(3, seed=4)
-    w["gains"] = np.linspace(0.5, 1, 3)
-    found = ensemble_residuals(design.controller, design.hardware, ensemble_of(w, turbulence=AIR))
-    agree(found, design, w, lambda i: AIR)
+def test_a_mirror_with_dynamics():
+    w = weather(3, seed=4) | {"gains": np.linspace(0.5, 1, 3)}
+    assert not agree(designed("mirror"), w, AIR, lambda i: AIR)
 
 
 @pytest.mark.parametrize(("delay", "distance"), [(2.3, 1e-7), (3.0, 1e-3), (4.7, 1e-5)])
 def test_next_to_instability(delay, distance):
     """A process, whose residual is a Lyapunov equation's, as a spectrum."""
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
-    low, high = 0.0, 2.0
-    for _ in range(50):
-        middle = (low + high) / 2
-        controller = lbt.Controller(A=1.0, B=middle, C=1.0, D=0.0, dt_s=1 / RATE)
-        stable = lbt.close_loop(path, controller).is_stable
-        low, high = (middle, high) if stable else (low, middle)
-    controller = replace(controller, B=np.array([[low * (1 - distance)]]))
-    loop = lbt.close_loop(path, controller)
-    truths = lbt.Truth(turbulence=SLOW), lbt.Truth(turbulence=SumSpectrum(parts=[SLOW]))
+    gain = lbt.design.integrator_gain_limit(path) * (1 - distance)
+    controller = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=1 / RATE)
+    loop, spectrum = lbt.close_loop(path, controller), SumSpectrum(parts=[SLOW])
     exact, single = (
-        lbt.residual_budget(loop, truth, frame_means=True).turbulence_nm for truth in truths
+        lbt.residual_budget(loop, lbt.Truth(turbulence=air), frame_means=True).turbulence_nm
+        for air in (SLOW, spectrum)
     )
-    assert single == pytest.approx(exact, rel=5e-7)
-    ensemble = LoopEnsemble(turbulence=truths[1].turbulence)
-    found = ensemble_residuals(controller, path, ensemble, frame_means=True)
-    assert found.turbulence_nm[0] == pytest.approx(exact, rel=5e-7)
-    found = ensemble_residuals(controller, path, LoopEnsemble(turbulence=SLOW))
-    moving = lbt.residual_budget(loop, truths[0])
-    assert found.rms_nm[0] == pytest.approx(moving.rms_nm, rel=5e-7)
+    ensemble = LoopEnsemble(turbulence=spectrum)
+    many = ensemble_residuals(controller, ensemble, path, frame_means=True).turbulence_nm[0]
+    assert (single, many) == pytest.approx((exact, exact), rel=5e-7)
+    moving = lbt.residual_budget(loop, lbt.Truth(turbulence=SLOW)).rms_nm
+    many = ensemble_residuals(controller, LoopEnsemble(turbulence=SLOW), path).rms_nm
+    assert many[0] == pytest.approx(moving, rel=5e-7)
 
 
 def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
     """A resonator without damping, and an exposure that ends within a frame."""
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2.3, modes=1)
-    turn = [[0.0, -1.0], [1.0, 0.0]]
-    entries = ([[0.05], [0.0]], [[0.0], [0.05]], [[-0.05], [0.0]], [[0.0], [-0.05]])
-    resonators = [
-        lbt.Controller(A=turn, B=B, C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE) for B in entries
-    ]
-    controller = next(one for one in resonators if lbt.close_loop(path, one).is_stable)
+    parts = {"A": [[0.0, -1.0], [1.0, 0.0]], "B": [[-0.05], [0.0]], "C": [[1.0, 0.0]], "D": 0.0}
+    controller = lbt.Controller(**parts, dt_s=1 / RATE)
     line = EnsembleVibration(frequency_hz=[RATE / 4, RATE / 4 + 1], rms_nm=100.0, direction=(1.0,))
     ensemble = LoopEnsemble(sensor_gain=[0.9, 0.9], vibrations=[line])
-    found = ensemble_residuals(controller, path, ensemble, frame_means=True)
-    assert np.abs(found.line_amplitudes_nm)[0, 0, 0] < 1e-9
+    means = ensemble_residuals(controller, ensemble, path, frame_means=True)
+    assert np.abs(means.line_amplitudes_nm)[0, 0, 0] < 1e-9
     # the commands turn by a quarter from frame to frame: the camera sees what lies between
-    seen = ensemble_residuals(controller, path, ensemble)
+    seen = ensemble_residuals(controller, ensemble, path)
     assert np.all(seen.rms_nm > 0.3 * 100)
     beside = SinusoidalVibration(frequency_hz=RATE / 4 + 1, rms_nm=100.0, direction=(1.0,))
     truth = lbt.Truth(turbulence=None, sensor_gain=0.9, vibrations=(beside,))
@@ -184,49 +157,47 @@ def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
     assert seen.rms_nm[1] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-9)
 
 
-def test_a_loop_is_split_into_parts(kalman, coupled):
+def test_a_loop_is_split_into_parts():
     # an axis without a vibration is another part than one with
-    uneven = lbt.kalman(plant(vibrations=[LINE]))
-    for design, modes in ((kalman, [[[0], [1]]]), (coupled, [[[0, 1]]]), (uneven, [[[0]], [[1]]])):
-        parts, rest = split_into_parts(textbook_matrices([design.controller]), design.hardware)
-        assert [own.tolist() for own, *_ in parts] == modes
-        assert rest == []
+    expected = {"kalman": [[[0], [1]]], "coupled": [[[0, 1]]], "uneven": [[[0]], [[1]]]}
+    for name, modes in expected.items():
+        matrices = textbook_matrices([designed(name).controller])
+        parts, rest = split_into_parts(matrices, designed(name).hardware)
+        assert ([own.tolist() for own, *_ in parts], rest) == (modes, [])
 
 
-def test_states_in_odd_units_stay_coupled(coupled):
+def test_states_in_odd_units_stay_coupled():
     """The same controller in states of 1e9 times other units is the same controller."""
-    k = coupled.controller
+    path, k = designed("coupled").hardware, designed("coupled").controller
     units = 10.0 ** np.linspace(-9, 9, k.n_states)
-    odd = lbt.Controller(
-        A=k.A * units / units[:, None], B=k.B / units[:, None], C=k.C * units, D=k.D, dt_s=k.dt_s
-    )
+    A, B, C = k.A * units / units[:, None], k.B / units[:, None], k.C * units
     ensemble = LoopEnsemble(sensor_gain=[0.5, 1.0], noise_nm=15.5, turbulence=AIR)
-    one, other = (ensemble_residuals(c, coupled.hardware, ensemble) for c in (k, odd))
-    assert other.rms_nm == pytest.approx(one.rms_nm, rel=1e-8)
+    odd = lbt.Controller(A=A, B=B, C=C, D=k.D, dt_s=k.dt_s)
+    one, other = (ensemble_residuals(c, ensemble, path).rms_nm for c in (k, odd))
+    assert other == pytest.approx(one, rel=1e-8)
 
 
 def test_a_state_that_no_mode_sees_counts_for_stability():
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     for pole, stable in ((0.5, True), (1.1, False)):
-        hidden = lbt.Controller(
-            A=np.diag([1.0, pole]), B=[[0.3], [0.0]], C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE
-        )
-        found = ensemble_residuals(hidden, path, LoopEnsemble(noise_nm=[1.0, 2.0]))
-        assert found.stable.tolist() == [stable] * 2
+        parts = {"A": np.diag([1.0, pole]), "B": [[0.3], [0.0]], "C": [[1.0, 0.0]], "D": 0.0}
+        hidden = lbt.Controller(**parts, dt_s=1 / RATE)
+        many = ensemble_residuals(hidden, LoopEnsemble(noise_nm=[1.0, 2.0]), path)
+        assert many.stable.tolist() == [stable] * 2
 
 
-def test_numbers_that_no_loop_has_are_refused(kalman):
+def test_numbers_that_no_loop_has_are_refused():
     other = ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)
     fast = EnsembleVibration(frequency_hz=[20, 400], rms_nm=1)
 
     def met(**facts):
-        return ensemble_residuals(kalman.controller, kalman.hardware, LoopEnsemble(**facts))
+        return lambda: ensemble_residuals(designed("kalman"), LoopEnsemble(**facts))
 
     rows = [
-        (lambda: met(sensor_gain=0.0), ProblemError, "sensor_gain must be above 0"),
-        (lambda: met(noise_nm=-1.0), ProblemError, "noise_nm must be at least 0"),
-        (lambda: met(turbulence=other), ProblemError, "sampled at the loop's 800 Hz; got 500 Hz"),
-        (lambda: met(vibrations=[fast]), ProblemError, "below the Nyquist"),
+        (met(sensor_gain=0.0), ProblemError, "sensor_gain must be above 0"),
+        (met(noise_nm=-1.0), ProblemError, "noise_nm must be at least 0"),
+        (met(turbulence=other), ProblemError, "sampled at the loop's 800 Hz; got 500 Hz"),
+        (met(vibrations=[fast]), ProblemError, "below the Nyquist"),
         (lambda: EnsembleVibration(frequency_hz=0.0, rms_nm=1), ProblemError, "above 0"),
     ]
     require_refusals(rows)

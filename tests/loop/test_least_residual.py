@@ -28,13 +28,22 @@ def test_processes_whose_variance_is_known():
     assert variance(path(), turbulence=None, noise_nm=5.0) == 0.0
 
 
-def test_a_sensor_gain_is_a_scale_of_the_noise():
+@pytest.mark.parametrize(
+    ("facts", "noise_nm", "sensor_gain", "expected_nm"),
+    [
+        ({}, 0.12, 0.3, [0.4]),  # a sensor gain is a scale of the noise, known or believed
+        ({"sensor_matrix": [[0.3]]}, 0.12, 1.0, [0.4]),
+        ({}, 0.8, 2.0, [0.4]),
+        ({"sensor_matrix": [[2.0]]}, 0.8, 1.0, [0.4]),
+        ({"sensor_matrix": [[1.0], [1.0]]}, 2.0, 1.0, [np.sqrt(2)]),  # two sensors halve it
+        ({"modes": 2, "sensor_matrix": [[2.0, 1.0], [1.0, 2.0]]}, 3.0, 1.0, [3.0, 1.0]),  # undone
+    ],
+)
+def test_sensors_that_tell_the_same_have_the_same_limit(facts, noise_nm, sensor_gain, expected_nm):
     model = {"turbulence": ar(1.5, -0.8)}
-    base = variance(path(), **model, noise_nm=0.4)
-    for gain in (0.3, 2.0):
-        weak = variance(path(), **model, noise_nm=0.4 * gain, sensor_gain=gain)
-        believed = variance(path(sensor_matrix=[[gain]]), **model, noise_nm=0.4 * gain)
-        assert (weak, believed) == pytest.approx((base, base), rel=1e-9)
+    limit = variance(path(**facts), **model, noise_nm=noise_nm, sensor_gain=sensor_gain)
+    expected = sum(variance(path(), **model, noise_nm=alone) for alone in expected_nm)
+    assert limit == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(("noise", "delay"), [(1e-6, 1), (1e-3, 2), (1.0, 4), (1e6, 2)])
@@ -72,23 +81,14 @@ def test_kalman_filters_reach_the_limit(delay, seed):
     rng = np.random.default_rng(seed)
     roots = rng.uniform(0.1, 0.999, 3) * np.exp(1j * rng.uniform(0, np.pi, 3))
     a = -np.poly(np.concatenate([roots, roots.conj()])).real[1:]
+    numbers = zip(rng.uniform(5, 390, 2), rng.uniform(-5, -1, 2), rng.uniform(0, 3, 2), strict=True)
     lines = [
-        lbt.Vibration(
-            frequency_hz=rng.uniform(5, 390),
-            damping=10 ** rng.uniform(-5, -1),
-            rms_nm=10 ** rng.uniform(0, 3),
-            direction=(1,),
-        )
-        for _ in range(2)
+        lbt.Vibration(frequency_hz=f, damping=10**k, rms_nm=10**size, direction=(1,))
+        for f, k, size in numbers
     ]
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE,
-        turbulence=ar(*a, driving=10 ** rng.uniform(-1, 2)),
-        vibrations=lines,
-        noise_nm=10 ** rng.uniform(-2, 2),
-        delay_frames=delay,
-        modes=1,
-    )
+    facts = {"frame_rate_hz": RATE, "delay_frames": delay, "vibrations": lines, "modes": 1}
+    air, noise_nm = ar(*a, driving=10 ** rng.uniform(-1, 2)), 10 ** rng.uniform(-2, 2)
+    plant = lbt.tip_tilt_plant(**facts, turbulence=air, noise_nm=noise_nm)
     limit, design = least_residual(plant.hardware, plant), lbt.kalman(plant)
     means = np.sum(limit.variance_nm2 - limit.within_nm2)
     assert design.rms**2 == pytest.approx(means, rel=2e-8, abs=1e-12 * limit.rms_nm**2)
@@ -104,16 +104,15 @@ def moving_power(spectra, frame_rate_hz, *, of_means):
     return np.sum(density * (1 / share - 1 if of_means else 1 - share)) * (f[1] - f[0])
 
 
-def test_limit_of_the_example(config):
-    hardware, (line, *_) = config.hardware, config.truth.vibrations
-    means = lbt.loop.least_residual(hardware, config.truth, frame_means=True).rms_nm
+def test_limit_of_the_example(config, lbt_designs):
+    hardware, (line, *_), design = config.hardware, config.truth.vibrations, lbt_designs["kalman"]
+    means = least_residual(hardware, config.truth, frame_means=True).rms_nm
     assert means == pytest.approx(10.8414, abs=1e-4)
-    limit = lbt.loop.least_residual(hardware, config.truth)
+    limit = least_residual(hardware, config.truth)
     floor = line.rms_nm**2 * (1 - np.sinc(line.frequency_hz / RATE) ** 2)
     air = moving_power([config.truth.turbulence] * hardware.modes, RATE, of_means=False)
     assert limit.within_nm2.sum() == pytest.approx(floor + air, rel=1e-4)
     assert limit.rms_nm**2 == pytest.approx(means**2 + floor + air, rel=3e-2)
-    design = lbt.kalman(config.plant)
     residual_nm, limit_nm, above = model_limits(design).values()
     models = [line.ar_model(RATE) for line in config.plant.vibrations]
     power = moving_power([*config.plant.turbulence, *models], RATE, of_means=True)
@@ -125,62 +124,42 @@ def test_limit_of_the_example(config):
 
 def test_a_sinusoid_of_known_frequency_costs_what_moves_within_a_frame():
     line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797, direction=(1,))
-    with_line = variance(path(), turbulence=ar(0.99), noise_nm=3.0, vibrations=(line,))
-    assert with_line == variance(path(), turbulence=ar(0.99), noise_nm=3.0)
-    floor = 797**2 * (1 - np.sinc(20 / RATE) ** 2)
+    calm, floor = {"turbulence": ar(0.99), "noise_nm": 3.0}, 797**2 * (1 - np.sinc(20 / RATE) ** 2)
+    still = variance(path(), **calm)
+    assert variance(path(), **calm, vibrations=(line,)) == still
     for delay in (1, 1.5, 2, 2.49, 3):
-        still = {"turbulence": ar(0.99), "noise_nm": 3.0, "frame_means": False}
-        more = variance(path(delay), **still, vibrations=(line,)) - variance(path(delay), **still)
-        assert more == pytest.approx(floor, rel=1e-9)
-    narrow = [
-        variance(
-            path(),
-            turbulence=ar(0.99),
-            noise_nm=3.0,
-            vibrations=(lbt.Vibration(frequency_hz=20, damping=k, rms_nm=797, direction=(1,)),),
+        bare, shaken = (
+            variance(path(delay), **calm, vibrations=lines, frame_means=False)
+            for lines in ((), (line,))
         )
-        for k in (1e-2, 1e-6, 1e-10)
+        assert shaken - bare == pytest.approx(floor, rel=1e-9)
+    narrow = [
+        lbt.Vibration(frequency_hz=20, damping=damping, rms_nm=797, direction=(1,))
+        for damping in (1e-2, 1e-6, 1e-10)
     ]
-    assert narrow[0] > narrow[1] > narrow[2] > with_line
-    assert narrow[2] == pytest.approx(with_line, rel=1e-2)
+    limits = [variance(path(), **calm, vibrations=(line,)) for line in narrow]
+    assert limits[0] > limits[1] > limits[2] > still
+    assert limits[2] == pytest.approx(still, rel=1e-2)
 
 
 def coupled_plant(ratio=2.0, **options):
     """A line along a diagonal over turbulence of another size on either axis."""
     slow = [ar(1.98, -0.9805, driving=driving) for driving in (1.0, ratio)]
     line = lbt.Vibration(frequency_hz=30, damping=0.01, rms_nm=50, direction=(1, 1))
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=slow, vibrations=[line], noise_nm=10.0, **options
-    )
+    facts = {"turbulence": slow, "vibrations": [line], "noise_nm": 10.0}
+    return lbt.tip_tilt_plant(frame_rate_hz=RATE, **facts, **options)
 
 
 @pytest.mark.parametrize("delay", [1.0, 3.0])
 def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
-    plant = coupled_plant(delay_frames=delay)
+    plant, *others = (coupled_plant(ratio, delay_frames=delay) for ratio in (2.0, 1, 1.001))
     limit = least_residual(plant.hardware, plant)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
     along = limit.directions.T * limit.variance_nm2 @ limit.directions
     assert along == pytest.approx(lbt.residual_budget(loop, plant).total_nm2, rel=1e-7)
     # a little coupling changes little
-    alone, nearly = (
-        least_residual(p.hardware, p)
-        for p in (coupled_plant(r, delay_frames=delay) for r in (1, 1.001))
-    )
-    assert nearly.rms_nm == pytest.approx(alone.rms_nm, rel=1e-3)
-    assert nearly.rms_nm > alone.rms_nm
-
-
-def test_more_measurements_than_modes():
-    """Two equal sensors of one mode halve the noise; a mixed sensor can be undone."""
-    model = {"turbulence": ar(0.99)}
-    double = path(sensor_matrix=[[1.0], [1.0]])
-    assert variance(double, **model, noise_nm=2.0) == pytest.approx(
-        variance(path(), **model, noise_nm=np.sqrt(2))
-    )
-    mixed = path(modes=2, sensor_matrix=[[2.0, 1.0], [1.0, 2.0]])  # noise of 1 and 1/3
-    assert variance(mixed, **model, noise_nm=3.0) == pytest.approx(
-        variance(path(), **model, noise_nm=3.0) + variance(path(), **model, noise_nm=1.0)
-    )
+    alone, nearly = (least_residual(other.hardware, other).rms_nm for other in others)
+    assert alone < nearly == pytest.approx(alone, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -226,13 +205,9 @@ def test_refusals():
     def on(**facts):
         return least(SLANTED, on=path(**facts))
 
-    own = "loop's own sensor; got others"
+    rank = "see every mode; got a matrix of rank 1 for 2"
     rows = [
-        (
-            on(sensor_matrix=[[1.0, 1.0]]),
-            ProblemError,
-            "see every mode; got a matrix of rank 1 for 2",
-        ),
+        (on(sensor_matrix=[[1.0, 1.0]]), ProblemError, rank),
         (on(influence_matrix=[[1.0], [1.0]]), ProblemError, "reach every mode"),
         (on(sensor_matrix=np.diag([1.0, 2.0])), ProblemError, "principal axes of the"),
         (least(SLANTED, UPRIGHT, on=path(modes=2)), ProblemError, "that decouple.*Turn the dir"),
@@ -240,11 +215,11 @@ def test_refusals():
         (least(turbulence=OTHER_RATE), ProblemError, "the loop's 800 Hz; got 500"),
         (least(turbulence=strong, noise_nm=1e-155), ProblemError, "a size that sensors have"),
         (lambda: least_residual(late.hardware, late), CoupledModesError, "modes that decouple"),
-        (least(on=beside), ProblemError, own),
+        (least(on=beside), ProblemError, "loop's own sensor; got others"),
         (least(on=path(mirror=shell(100))), ProblemError, "got dynamics"),
         (least(on=path(2.6)), ProblemError, "at most a half beyond whole frames"),
     ]
     wrong = (lambda f: -np.ones(f.shape), lambda f: f * np.nan, lambda f: np.ones(3))
-    words = r"Anonymous.psd does not"
+    words = "Anonymous.psd does not"
     rows += [(least(turbulence=Anonymous(psd)), ProblemError, words) for psd in wrong]
     require_refusals(rows)

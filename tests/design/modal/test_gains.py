@@ -6,19 +6,25 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
+from support.limits import Anonymous
+from support.lqg import shell
 from support.modal import RATE, integrator_residuals, integrator_run, path_of
-from support.refusals import refused, require_refusals
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.design.modal import modal_gains, modal_gains_from_telemetry
 from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError, ProblemError
-from lbt_synth.models import ARModel, PositionLoop, TabulatedSpectrum
+from lbt_synth.models import ARModel, TabulatedSpectrum
 
 
 def ar_series(coefficients, driving, modes, frames, rng):
     """Stationary series of one process, (modes, frames)."""
     white = driving * rng.standard_normal((modes, frames + 30_000))
     return lfilter([1.0], [1.0, *(-np.array(coefficients))], white, axis=1)[:, 30_000:]
+
+
+def process(coefficients, driving_nm):
+    return ARModel(coefficients=coefficients, driving_rms_nm=driving_nm, frame_rate_hz=RATE)
 
 
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,))
@@ -33,35 +39,28 @@ def best_integrator(path, truth):
         return lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else 1e6 * gain
 
     grid = np.geomspace(0.001, 2, 20) / truth.sensor_gain
-    place = int(np.argmin([residual(gain) for gain in grid]))  # there may be two minima
+    place = int(np.argmin([*map(residual, grid)]))  # there may be two minima
     bounds = grid[place - 1], grid[place + 1]
     best = minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-7})
     return best.x, best.fun
 
 
 def air_of(pole, driving, modes=1):
-    """Return turbulence of first order, the same on all modes."""
-    return ARModel(
-        coefficients=np.full((modes, 1), pole),
-        driving_rms_nm=np.full(modes, driving),
-        frame_rate_hz=RATE,
-    )
+    return process(np.full((modes, 1), pole), np.full(modes, driving))
 
 
 @pytest.mark.parametrize(("delay", "noise", "sensor_gain"), [(2, 60.0, 0.6), (2.5, 2.0, 1.3)])
 def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_gain):
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
-    ar1 = lbt.models.ar1_turbulence(air, frame_rate_hz=RATE)
-    table = TabulatedSpectrum(
-        frequency_hz=[0, 1, 5, 30, 31, 32, 400], density_nm2_hz=[4e4, 4e4, 50, 1, 90, 0.5, 0.01]
-    )
-    known = {"noise_nm": noise, "sensor_gain": sensor_gain}
-    sharp = replace(LINE, damping=1e-4).ar_model(RATE)
-    spectra = [air, table, ar1, sharp]
-    gains = modal_gains(spectra, hardware=path, vibrations={2: LINE}, **known)
-    moving = replace(LINE, rms_nm=LINE.rms_nm / np.sinc(20 / RATE))
-    for i, (spectrum, lines) in enumerate([(air, ()), (table, ()), (ar1, (moving,)), (sharp, ())]):
-        truth = lbt.Truth(turbulence=spectrum, vibrations=lines, **known)
+    path, moving = path_of(delay_frames=delay, modes=1), LINE.rms_nm / np.sinc(20 / RATE)
+    ar1, sharp = lbt.models.ar1_turbulence(air, frame_rate_hz=RATE), replace(LINE, damping=1e-4)
+    density = [4e4, 4e4, 50, 1, 90, 0.5, 0.01]
+    table = TabulatedSpectrum(frequency_hz=[0, 1, 5, 30, 31, 32, 400], density_nm2_hz=density)
+    spectra = [air, table, ar1, sharp.ar_model(RATE)]
+    facts = {"noise_nm": noise, "sensor_gain": sensor_gain}
+    gains = modal_gains(spectra, hardware=path, vibrations={2: LINE}, **facts)
+    for i, spectrum in enumerate(spectra):
+        lines = (replace(LINE, rms_nm=moving),) if spectrum is ar1 else ()
+        truth = lbt.Truth(turbulence=spectrum, vibrations=lines, **facts)
         gain, rms_nm = best_integrator(path, truth)
         assert gains.rms_nm[i] == pytest.approx(rms_nm, rel=1e-6)
         # where the answer is exact, so is this
@@ -70,28 +69,21 @@ def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_g
 
 
 def test_residuals_are_those_of_the_loop():
-    rng = np.random.default_rng(0)
-    n = 200
-    air = ARModel(
-        coefficients=rng.uniform(0.5, 0.999, (n, 1)),
-        driving_rms_nm=10 ** rng.uniform(-1, 2, n),
-        frame_rate_hz=RATE,
-    )
-    noise, gain = 10 ** rng.uniform(0, 2, n), rng.uniform(0.3, 1.2, n)
-    known = {"noise_nm": noise, "sensor_gain": gain, "hardware": path_of(delay_frames=2.3)}
-    known["vibrations"] = {5: [LINE], 77: [LINE, LINE]}
-    best = modal_gains(air, **known)
-    least = integrator_residuals(best.gains, air, **known)
+    n, rng = 200, np.random.default_rng(0)
+    air = process(rng.uniform(0.5, 0.999, (n, 1)), 10 ** rng.uniform(-1, 2, n))
+    facts = {"noise_nm": 10 ** rng.uniform(0, 2, n), "sensor_gain": rng.uniform(0.3, 1.2, n)}
+    facts |= {"hardware": path_of(delay_frames=2.3), "vibrations": {5: [LINE], 77: [LINE, LINE]}}
+    best = modal_gains(air, **facts)
+    least = integrator_residuals(best.gains, air, **facts)
     assert np.allclose(least, best.rms_nm, rtol=1e-6)
-    smallest = 1e-4 * lbt.design.integrator_gain_limit(known["hardware"]) / gain
+    smallest = 1e-4 * lbt.design.integrator_gain_limit(facts["hardware"]) / facts["sensor_gain"]
     for factor in (0.9, 0.99, 1.01, 1.1):
         other = np.clip(factor * best.gains, smallest, best.limit)
-        assert np.all(integrator_residuals(other, air, **known) >= least * (1 - 1e-6))
+        assert np.all(integrator_residuals(other, air, **facts) >= least * (1 - 1e-6))
 
 
 def test_a_quiet_sensor_is_limited_by_stability():
-    fast = ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=RATE)
-    slow = ARModel(coefficients=[1.999, -0.99900025], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    slow, fast = process([1.999, -0.99900025], 1.0), process([0.999], 10.0)
     gains = modal_gains([slow, fast], noise_nm=[0.0, 0.5], hardware=path_of(), margin=0.5)
     assert gains.limited.tolist() == [True, False]
     assert gains.gains[0] == pytest.approx(0.5)
@@ -105,113 +97,94 @@ def test_a_quiet_sensor_is_limited_by_stability():
 
 @pytest.mark.parametrize(("bandwidth", "delay"), [(60.0, 2.4), (250.0, 2)])
 def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
-    shell = PositionLoop.from_bandwidth(
-        natural_frequency_hz=20, damping=0.5, bandwidth_hz=bandwidth
-    )
-    slow = ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1, mirror=shell)
-    truth = lbt.Truth(turbulence=slow, noise_nm=5.0, sensor_gain=0.8)
+    path = path_of(delay_frames=delay, modes=1, mirror=shell(bandwidth))
+    air, facts = air_of(0.99, 10.0), {"noise_nm": 5.0, "hardware": path, "sensor_gain": 0.8}
+    truth = lbt.Truth(turbulence=air, noise_nm=5.0, sensor_gain=0.8)
     gain, rms_nm = best_integrator(path, truth)
-    known = {"sensor_gain": 0.8, "hardware": path}
-    gains = modal_gains([slow], noise_nm=5.0, **known)
-    assert gains.gains[0] == pytest.approx(gain, rel=1e-5)
-    assert gains.rms_nm[0] == pytest.approx(rms_nm, rel=1e-6)
-    air = ARModel.stack([slow])
-    residual = integrator_residuals(gains.gains, air, noise_nm=5.0, **known)
-    assert residual == pytest.approx(gains.rms_nm, rel=1e-6)
-    limit, unit = gains.limit[0] / (1 - 0.001), known | {"sensor_gain": 1.0, "noise_nm": 5.0}
-    inside, outside = (integrator_residuals([f * limit], air, **unit) for f in (0.999, 1.001))
-    assert np.isfinite(inside)
-    assert np.isnan(outside)
+    gains = modal_gains(air, **facts)
+    assert gains.gains == pytest.approx(gain, rel=1e-5)
+    residual = integrator_residuals(gains.gains, air, **facts)
+    assert (*gains.rms_nm, *residual) == pytest.approx((rms_nm, rms_nm), rel=1e-6)
+    limits = gains.limit[0] / (1 - 0.001) * np.array([0.999, 1.001])
+    unit = facts | {"sensor_gain": 1.0}
+    inside, outside = (integrator_residuals([limit], air, **unit) for limit in limits)
+    assert (np.isfinite(inside), np.isnan(outside)) == (True, True)
     # and from its telemetry
     rng = np.random.default_rng(6)
     total = ar_series([0.99], 10.0, 8, 20_000, rng)
-    noise = 5.0 * rng.standard_normal(total.shape)
-    series = integrator_run(np.full(8, gains.gains[0] / 2), total, noise, **known)
-    seen = modal_gains_from_telemetry(*series, noise_nm=5.0, segment_frames=64, **known)
+    noise, facts = 5.0 * rng.standard_normal(total.shape), {"sensor_gain": 0.8, "hardware": path}
+    series = integrator_run(np.full(8, gains.gains[0] / 2), total, noise, **facts)
+    seen = modal_gains_from_telemetry(*series, noise_nm=5.0, segment_frames=64, **facts)
     assert np.mean(seen.gains) == pytest.approx(gains.gains[0], rel=0.05)
     assert np.mean(seen.rms_nm) == pytest.approx(gains.rms_nm[0], rel=0.02)
 
 
-class Odd:
-    """A spectrum that is below zero at low frequencies."""
-
-    def psd(self, frequency_hz):
-        return np.where(frequency_hz > 10, -1.0, 1.0)
-
-
-class Lines:
-    """A comb of lines that no quadrature finds twice."""
-
-    def psd(self, frequency_hz):
-        return np.sin(1e9 * frequency_hz) ** 200
-
-
-def test_bad_input_is_refused(air):
-    ar1 = lbt.models.ar1_turbulence(air, frame_rate_hz=RATE)
-    known = {"noise_nm": 1, "hardware": path_of()}
-    rate = {"hardware": path_of(frame_rate_hz=500)}
+def test_bad_input_is_refused():
+    ar1, series = process([0.9], 1.0), np.zeros((3000, 2))
+    # a spectrum that is below zero at low frequencies, and lines that no quadrature finds twice
+    odd = Anonymous(lambda f: np.where(f > 10, -1.0, 1.0))
+    comb = Anonymous(lambda f: np.sin(1e9 * f) ** 200)
     nothing = TabulatedSpectrum(frequency_hz=[0, 1], density_nm2_hz=[0, 0])
-    for spectra, arguments, error, words in (
-        ([ar1], {"noise_nm": -1}, ProblemError, "noise_nm must be at least 0"),
-        ([ar1], {"noise_nm": [1, 2]}, DimensionError, "one per mode"),
-        ([ar1], {"margin": 0}, ProblemError, "margin must be at least"),
-        ([ar1], {"margin": 0.9999}, ProblemError, "leave room"),
-        ([ar1], {"sensor_gain": 1e-6}, ProblemError, "leave room"),
-        ([ar1], {"hardware": 3}, ProblemError, "hardware must be a LoopHardware"),
-        ([], {}, ProblemError, "one spectrum per mode"),
-        (800, {}, ProblemError, "one spectrum per mode"),
-        ([ar1, 3], {}, ProblemError, "one spectrum per mode"),
-        ([ar1, Odd()], {}, ProblemError, "that of mode 1 is not"),
-        ([Lines()], {"noise_nm": 0}, NumericalError, "did not settle"),
-        ([ar1], {"vibrations": {0: 3}}, ProblemError, "list of Vibration"),
-        ([ar1], rate, ProblemError, "sampled at the loop's 500 Hz; got 800 Hz"),
-        (ARModel.stack([ar1]), rate, ProblemError, "the loop's 500 Hz; got 800 Hz"),
-        ([nothing], {"noise_nm": 0}, ProblemError, "got none in mode 0"),
-    ):
-        refused(lambda s=spectra, a=arguments: modal_gains(s, **(known | a)), error, words)
-    series = np.zeros((3000, 2))
 
-    def telemetry(y, u, **changes):
+    def gains(spectra=(ar1,), noise_nm=1, **changes):
+        facts = {"noise_nm": noise_nm, "hardware": path_of()} | changes
+        return lambda: modal_gains(spectra, **facts)
+
+    def telemetry(y=series, u=series, **changes):
         return lambda: modal_gains_from_telemetry(y, u, hardware=path_of(), **changes)
 
+    slower = path_of(frame_rate_hz=500)
     require_refusals(
         [
-            (telemetry(series, series[1:]), DimensionError, "must both be"),
+            (gains(noise_nm=-1), ProblemError, "noise_nm must be at least 0"),
+            (gains(noise_nm=[1, 2]), DimensionError, "one per mode"),
+            (gains(margin=0), ProblemError, "margin must be at least"),
+            (gains(margin=0.9999), ProblemError, "leave room"),
+            (gains(sensor_gain=1e-6), ProblemError, "leave room"),
+            (gains(hardware=3), ProblemError, "hardware must be a LoopHardware"),
+            (gains([]), ProblemError, "one spectrum per mode"),
+            (gains(800), ProblemError, "one spectrum per mode"),
+            (gains([ar1, 3]), ProblemError, "one spectrum per mode"),
+            (gains([ar1, odd]), ProblemError, "that of mode 1 is not"),
+            (gains([comb], 0), NumericalError, "did not settle"),
+            (gains(vibrations={0: 3}), ProblemError, "list of Vibration"),
+            (gains(hardware=slower), ProblemError, "sampled at the loop's 500 Hz; got 800 Hz"),
+            (gains(air_of(0.9, 1.0), hardware=slower), ProblemError, "loop's 500 Hz; got 800 Hz"),
+            (gains([nothing], 0), ProblemError, "got none in mode 0"),
+            (telemetry(u=series[1:]), DimensionError, "must both be"),
             (telemetry(series[:900], series[:900]), ProblemError, "longer than a segment"),
-            (telemetry(series + np.nan, series), NonFiniteError, "measurements"),
-            (telemetry(series, series, segment_frames=8), ProblemError, "segment_frames"),
-            (telemetry(series, series), ProblemError, "got none in mode 0"),
+            (telemetry(series + np.nan), NonFiniteError, "measurements"),
+            (telemetry(segment_frames=8), ProblemError, "segment_frames"),
+            (telemetry(), ProblemError, "got none in mode 0"),
         ]
     )
 
 
 def test_telemetry_finds_what_the_models_say():
-    rng = np.random.default_rng(1)
-    n, frames, noise = 40, 60_000, 20.0
+    n, noise, rng = 40, 20.0, np.random.default_rng(1)
     poles, driving = np.linspace(0.9, 0.995, n), np.geomspace(3, 30, n)
-    air = ARModel(coefficients=poles[:, None], driving_rms_nm=driving, frame_rate_hz=RATE)
-    white = driving[:, None] * rng.standard_normal((n, frames))
-    total = [lfilter([1], [1, -p], w) for p, w in zip(poles, white, strict=True)]
-    known = {"hardware": path_of(delay_frames=2.5), "sensor_gain": np.linspace(0.5, 1.0, n)}
-    seen = noise * rng.standard_normal((n, frames))
-    series = integrator_run(np.full(n, 0.2), np.array(total), seen, **known)
-    exact = modal_gains(air, noise_nm=noise, **known)
+    white = driving[:, None] * rng.standard_normal((n, 60_000))
+    total = np.array([lfilter([1], [1, -p], w) for p, w in zip(poles, white, strict=True)])
+    facts = {"hardware": path_of(delay_frames=2.5), "sensor_gain": np.linspace(0.5, 1.0, n)}
+    seen = noise * rng.standard_normal(total.shape)
+    series = integrator_run(np.full(n, 0.2), total, seen, **facts)
+    air = process(poles[:, None], driving)
+    exact = modal_gains(air, noise_nm=noise, **facts)
 
     def loss(gains):
         """Return the most that gains from telemetry lose, in residual."""
-        residuals = integrator_residuals(gains.gains, air, noise_nm=noise, **known)
+        residuals = integrator_residuals(gains.gains, air, noise_nm=noise, **facts)
         return np.max(residuals / exact.rms_nm - 1)
 
-    gains = modal_gains_from_telemetry(*series, noise_nm=noise, **known)
+    gains = modal_gains_from_telemetry(*series, noise_nm=noise, **facts)
     assert loss(gains) < 0.02
     assert np.median(np.abs(gains.gains / exact.gains - 1)) < 0.1
     # longer segments tell the modes that are best left alone from those that wander
-    longer = modal_gains_from_telemetry(*series, noise_nm=noise, segment_frames=4096, **known)
+    longer = modal_gains_from_telemetry(*series, noise_nm=noise, segment_frames=4096, **facts)
     assert loss(longer) < 0.01
     # turbulence that is AR1 is not quiet at high frequencies: the noise comes out too high, and
     # nothing is lost by that
-    guessed = modal_gains_from_telemetry(*series, **known)
+    guessed = modal_gains_from_telemetry(*series, **facts)
     assert np.all(guessed.noise_nm > 0.97 * noise)
     assert loss(guessed) < 0.02
 
