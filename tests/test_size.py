@@ -14,17 +14,17 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3175,
+    "cli": 3177,
     "config": 1622,
-    "design": 5984,
+    "design": 5985,
     "files": 1252,
-    "identification": 8860,
+    "identification": 8861,
     "interop": 3687,
     "linear": 4749,
     "loop": 3953,
     "methods": 784,
     "models": 3749,
-    "report": 3269,
+    "report": 3272,
     "storage": 1126,
     "studies": 3200,
     "errors, validation": 554,
@@ -35,7 +35,7 @@ COUNTS = {
     "tuned constants": 498,
     "lines of tests": 25603,
     "lines of benchmarks": 3998,
-    "words of docs": 62512,
+    "words of docs": 62531,
 }
 
 
