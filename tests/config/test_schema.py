@@ -3,16 +3,8 @@
 from lbt_synth.config.schema import config_schema
 
 SCHEMA = config_schema()
-UNITS = {
-    "_hz": "[Hz]",
-    "_nm": "[nm",
-    "_mas": "[mas]",
-    "_m": "[m]",
-    "_um": "[um]",
-    "_deg": "[deg]",
-    "_arcsec": "[arcsec]",
-    "_frames": "[frames]",
-}
+UNITS = {f"_{unit}": f"[{unit}]" for unit in ("mas", "m", "um", "deg", "arcsec", "frames")}
+UNITS |= {"_hz": "[Hz]", "_nm": "[nm"}
 COUNTS = {"settle_frames"}  # of frames, not in frames
 
 

@@ -38,8 +38,8 @@ class Loop:
 
 
 GOOD = Loop(name="a", method="kalman", error_hz=-0.001, strehl=0.8, residual_nm=12.34, gamma=1 / 3)
-UNKNOWN = {"strehl": math.nan, "residual_nm": math.nan}
-WILD = Loop(name="b", method="hinf", error_hz=1, gamma=2.0, limit_nm=9.0, stable=False, **UNKNOWN)
+LOST = {"strehl": math.nan, "residual_nm": math.nan, "stable": False}
+WILD = Loop(name="b", method="hinf", error_hz=1, gamma=2.0, limit_nm=9.0, **LOST)
 ROWS = [GOOD, WILD]
 
 
@@ -64,9 +64,8 @@ def test_csv_and_json_hold_the_values_themselves():
     assert record["gamma"] == 1 / 3
     assert "limit_nm" not in json_record(GOOD, without=["limit_nm"])
     # a scaled value has the unit of tables in tables only
-    assert json_units(Loop) == {"error_hz": "Hz"} | dict.fromkeys(
-        ("residual_nm", "gamma", "limit_nm"), "nm"
-    )
+    in_nm = dict.fromkeys(("residual_nm", "gamma", "limit_nm"), "nm")
+    assert json_units(Loop) == {"error_hz": "Hz"} | in_nm
 
 
 def test_facts_leave_out_what_does_not_apply():
@@ -95,23 +94,12 @@ def test_a_row_takes_what_is_not_given_from_its_sources():
         strehl = 0.5
 
     row = fill_row(Loop, Margins(), GOOD, name="c", stable=False)
-    assert (row.name, row.stable) == ("c", False)
-    assert (row.gamma, row.strehl) == (3.0, 0.5)
-    assert (row.method, row.error_hz) == ("kalman", -0.001)
+    expected = {"name": "c", "method": "kalman", "error_hz": -0.001, "strehl": 0.5, "gamma": 3.0}
+    assert expected.items() | {("stable", False)} <= dataclasses.asdict(row).items()
     with pytest.raises(TypeError, match="missing"):
         fill_row(Loop, Margins(), name="c")
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (math.nan, "-"),
-        (np.float64(-0.0), "0"),
-        (math.inf, "inf"),
-        (1234567.0, "1.23457e+06"),
-        (np.bool_(True), "yes"),
-        (12345678, "12345678"),
-    ],
-)
-def test_cells(value, text):
-    assert cell_text(value) == text
+def test_cells():
+    values = math.nan, np.float64(-0.0), math.inf, 1234567.0, np.bool_(True), 12345678
+    assert [*map(cell_text, values)] == ["-", "0", "inf", "1.23457e+06", "yes", "12345678"]
