@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3169,
+    "cli": 3172,
     "config": 1622,
     "design": 5984,
     "files": 1252,
-    "identification": 8844,
+    "identification": 8857,
     "interop": 3687,
-    "linear": 4748,
+    "linear": 4749,
     "loop": 3945,
     "methods": 784,
     "models": 3749,
-    "report": 3263,
+    "report": 3264,
     "storage": 1060,
-    "studies": 3190,
+    "studies": 3271,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 28951,
+    "lines of tests": 28998,
     "lines of benchmarks": 3998,
-    "words of docs": 62412,
+    "words of docs": 62512,
 }
 
 

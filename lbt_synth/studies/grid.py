@@ -1,9 +1,10 @@
 """A grid of many samples: a function of some of them, an executor, and parts on disk.
 
-What a loop leaves has the same columns for one loop and for a stack of them. A part of a
-:class:`Sweep` holds the results of a fixed number of consecutive rows in a file that is named by
-them, and a sweep that was killed at any moment goes on with the rows that no part has. The work is
-done in line, by processes of this machine, or by a Dask cluster; nothing else imports Dask.
+What a loop leaves has the same columns for one loop and for a stack of them. Answers that fit on a
+page are kept in memory (:func:`evaluate`). A part of a :class:`Sweep` holds the results of a fixed
+number of consecutive rows in a file that is named by them, and a sweep that was killed at any
+moment goes on with the rows that no part has. The work is done in line, by processes of this
+machine, or by a Dask cluster; nothing else imports Dask.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent import futures
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import islice, pairwise, starmap
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 
@@ -44,6 +45,7 @@ from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
 from lbt_synth.validation import FloatArray, integer
 
+Answer = TypeVar("Answer")
 Rows = tuple[int, int]  # the first, and the one after the last
 Failure = tuple[int, str, str]  # a row, the controller without a result on it, and why
 Result = tuple[dict[str, FloatArray], list[Failure]]  # columns of some rows (b,), and failures
@@ -68,6 +70,29 @@ def residual_columns(budget: ResidualBudget, imaging: Imaging) -> dict[str, Any]
     """Return what a loop or p of them leave, by column (p,); nan where one is unstable."""
     columns = {column: getattr(budget, name) for column, name in RESIDUALS.items()}
     return {"stable": budget.stable * 1.0, "strehl": strehl(budget, imaging)} | columns
+
+
+def evaluate(
+    function: Callable[..., Answer],
+    samples: Iterable[Sequence[Any]],
+    executor: futures.Executor | None = None,
+) -> Iterator[Answer]:
+    """Yield a function of the arguments of each sample, in their order.
+
+    An executor has all samples at once; without one, each is evaluated when it is requested.
+    """
+    if executor is None:
+        yield from starmap(function, samples)
+        return
+    running = [executor.submit(function, *sample) for sample in samples]
+    try:
+        for row, future in enumerate(running):
+            with _explain_failure((row, row + 1)):
+                answer = future.result()
+            yield answer
+    finally:
+        for future in running:
+            future.cancel()
 
 
 class Part(NamedTuple):

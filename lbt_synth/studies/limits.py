@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -21,7 +22,7 @@ from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
-from lbt_synth.studies.grid import loop_columns
+from lbt_synth.studies.grid import evaluate, loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _GRID = 65  # shifts over the range of errors, at least
@@ -64,11 +65,13 @@ def limits(
     imaging: Imaging,
     *,
     errors_hz: Sequence[float] = (0.0,),
+    executor: Executor | None = None,
 ) -> LimitStudy:
     """Evaluate designs exactly under a truth, and compare them with the limits.
 
     The errors are true frequencies less those of the model [Hz], of the vibration that moves most;
-    the others move in proportion, over the whole range between the extremes.
+    the others move in proportion, over the whole range between the extremes. An executor works on
+    all designs at once.
     """
     if not designs:
         raise ProblemError("a study of limits needs at least one design; got none.")
@@ -92,11 +95,9 @@ def limits(
         least_worst = partial(least_worst_residual, alone, rest, band_hz=band_hz)
         band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
     bounds_nm = tuple(np.nan if bound is None else bound.rms_nm for bound in (limit, band))
-    met = hardware, truth, imaging
-    rows, curves = zip(
-        *(_limit_row(name, design, met, shifts, bounds_nm) for name, design in designs.items()),
-        strict=True,
-    )
+    loop = hardware, truth, imaging
+    samples = ((name, design, loop, shifts, bounds_nm) for name, design in designs.items())
+    rows, curves = zip(*evaluate(_limit_row, samples, executor), strict=True)
     return LimitStudy(
         rows=rows,
         limit=limit,
@@ -110,12 +111,12 @@ def limits(
 def _limit_row(
     name: str,
     design: Design,
-    met: tuple[LoopHardware, Truth, Imaging],
+    seen: tuple[LoopHardware, Truth, Imaging],
     shifts: FloatArray,
     bounds_nm: tuple[float, ...],
 ) -> tuple[Facts, FloatArray]:
     """Return the row of a design beside the two limits, and its residual at each shift, (s,)."""
-    hardware, truth, imaging = met
+    hardware, truth, imaging = seen
     loop = design.close(hardware, sensor_gain=truth.sensor_gain)
     numbers = loop_columns(loop, truth, imaging)
     residual_nm = numbers["residual_nm"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,7 +38,7 @@ from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.models.turbulence.ar_models import radial_orders
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
-from lbt_synth.studies.grid import loop_columns, residual_columns
+from lbt_synth.studies.grid import evaluate, loop_columns, residual_columns
 from lbt_synth.studies.limits import LimitStudy, limits
 from lbt_synth.validation import (
     BoolArray,
@@ -51,6 +52,7 @@ from lbt_synth.validation import (
 )
 
 FAMILIES = (MIXED.name, "central")
+_GAINS_AT_ONCE = 64  # of a map: one sample, of some hundredths of a second
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 
 
@@ -78,6 +80,7 @@ def robustness(
     errors_hz: Sequence[float],
     methods: Sequence[str] | None = None,
     gamma_ratio: float = 1.2,
+    executor: Executor | None = None,
 ) -> Iterator[Facts]:
     """Design at each frequency error and evaluate exactly against the same truth.
 
@@ -97,6 +100,8 @@ def robustness(
         filter.
     gamma_ratio : float, optional
         H-infinity bound as a multiple of each row's least gamma.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Yields
     ------
@@ -128,15 +133,21 @@ def robustness(
     names = methods or [method.name for method in reference_methods(estimators_only=True)]
     for name in names:
         choice(name, "method", record_methods())
-    for error_hz in [number(error, "errors_hz") for error in errors_hz]:
-        shifts = [
-            -truth.frequency_shift_hz(line.frequency_hz, error_hz) for line in plant.vibrations
-        ]
-        moved = retuned_plant(plant, shifts, hold="driving")
-        for name in names:
-            design = reference_design(name, moved, {"gamma_ratio": gamma_ratio})
-            closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
-            yield loop_row(name, error_hz, closed, truth, imaging)
+    errors, loop = [number(error, "errors_hz") for error in errors_hz], (plant, truth, imaging)
+    samples = ((loop, error_hz, name, gamma_ratio) for error_hz in errors for name in names)
+    yield from evaluate(_robustness_row, samples, executor)
+
+
+def _robustness_row(
+    loop: tuple[TipTiltPlant, Truth, Imaging], error_hz: float, method: str, gamma_ratio: float
+) -> Facts:
+    """Design for lines that an error has moved, and close the real loop."""
+    plant, truth, imaging = loop
+    shifts = [-truth.frequency_shift_hz(line.frequency_hz, error_hz) for line in plant.vibrations]
+    moved = retuned_plant(plant, shifts, hold="driving")
+    design = reference_design(method, moved, {"gamma_ratio": gamma_ratio})
+    closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
+    return loop_row(method, error_hz, closed, truth, imaging)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -193,6 +204,7 @@ def robustness_map(
     sensor_gains: ArrayLike,
     delay_errors_frames: ArrayLike = (0.0,),
     hardware: LoopHardware | None = None,
+    executor: Executor | None = None,
 ) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
 
@@ -213,6 +225,8 @@ def robustness_map(
         Real delay less that of the design [frames].
     hardware : LoopHardware, optional
         Loop to close; that of the design by default.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Returns
     -------
@@ -269,21 +283,15 @@ def robustness_map(
     moved_hz = np.array([[line.frequency_hz for line in lines] for lines in moved])  # (e, lines)
     require_matching_controller(hardware.own_sensor_alone(), as_controller(design))
     size = delays.size, gains.size, errors.size
-    delay, gain, place = (axis.ravel() for axis in np.indices(size))
-    ensemble = LoopEnsemble(
-        sensor_gain=gains[gain],
-        delay_frames=hardware.delay_frames + delays[delay],
-        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
-        turbulence=truth.turbulence,
-        vibrations=tuple(
-            replace(ensemble_vibration(line), frequency_hz=frequencies[place])
-            for line, frequencies in zip(truth.vibrations, moved_hz.T, strict=True)
-        ),
+    samples = (
+        (design, hardware, truth, imaging, moved_hz, delay, some)
+        for delay in delays
+        for some in np.array_split(gains, -(-gains.size // _GAINS_AT_ONCE))
     )
-    matrices = textbook_matrices([as_controller(design)])
-    columns = residual_columns(ensemble_residuals(matrices, hardware, ensemble), imaging)
+    stacks = list(evaluate(_map_columns, samples, executor))
     strehl, residual_nm, stable = (
-        read_only(columns[name].reshape(size)) for name in ("strehl", "residual_nm", "stable")
+        read_only(np.concatenate([stack[name] for stack in stacks]).reshape(size))
+        for name in ("strehl", "residual_nm", "stable")
     )
     return RobustnessMap(
         errors_hz=errors,
@@ -293,6 +301,30 @@ def robustness_map(
         residual_nm=residual_nm,
         stable=read_only(stable[..., 0] == 1),
     )
+
+
+def _map_columns(
+    design: Design,
+    hardware: LoopHardware,
+    truth: Truth,
+    imaging: Imaging,
+    moved_hz: FloatArray,
+    delay_error_frames: float,
+    gains: FloatArray,
+) -> dict[str, FloatArray]:
+    """Return the columns of loops of all gains, with the lines at e frequencies (e, lines)."""
+    ensemble = LoopEnsemble(
+        sensor_gain=np.repeat(gains, len(moved_hz)),
+        delay_frames=hardware.delay_frames + delay_error_frames,
+        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
+        turbulence=truth.turbulence,
+        vibrations=tuple(
+            replace(ensemble_vibration(line), frequency_hz=np.tile(line_hz, gains.size))
+            for line, line_hz in zip(truth.vibrations, moved_hz.T, strict=True)
+        ),
+    )
+    matrices = textbook_matrices([as_controller(design)])
+    return residual_columns(ensemble_residuals(matrices, hardware, ensemble), imaging)
 
 
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
@@ -311,6 +343,7 @@ def compare_on_mirror(
     imaging: Imaging,
     *,
     command_weight: float = 0.0,
+    executor: Executor | None = None,
 ) -> LimitStudy:
     """Compare designs on a plant's moving mirror: what it costs to ignore its dynamics.
 
@@ -327,7 +360,7 @@ def compare_on_mirror(
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
     }
-    return limits(designs, hardware, truth, imaging)
+    return limits(designs, hardware, truth, imaging, executor=executor)
 
 
 def tradeoff(
@@ -335,6 +368,7 @@ def tradeoff(
     *,
     points: int = 9,
     taps: int = 16,
+    executor: Executor | None = None,
 ) -> Iterator[Facts]:
     """Return filters from the least norm to the least variance, and examine their loops.
 
@@ -349,6 +383,8 @@ def tradeoff(
         Levels of the norm, at least 2.
     taps : int, optional
         Length of the mixed filters' impulse response.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Yields
     ------
@@ -387,29 +423,44 @@ def tradeoff(
     spread = max(best.gamma / least.gamma_least, 1.0)
     levels = least.gamma_least * spread ** (np.linspace(0, 1, count) ** _CROWDING)
     ends: dict[int, FilterDesign] = {0: least, count - 1: best}
-    size = {"unit": "nm", "format": ".2f"}
-    for i, level in enumerate(levels.tolist()):
-        for family in FAMILIES:
-            if (design := ends.get(i)) is None and family == MIXED.name:
-                design = mixed(problem, gamma=level, taps=length)
-            elif design is None:
-                design = central_filter(problem, gamma=level)
-            margins = None
-            if design.hardware is not None:
-                margins = loop_margins(close_loop(design.hardware, design.controller))
-            names = ("gain_low", "gain_high", "modulus")
-            gain_low, gain_high, modulus = (getattr(margins, name, np.nan) for name in names)
-            ratio = max(design.gamma / least.gamma_least, 1.0)
-            yield facts(
-                family=fact(family, "filter"),
-                gamma=fact(design.gamma, "norm", **size),
-                gamma_ratio=fact(ratio, "norm / least", format=".4f"),
-                rms=fact(design.rms, "rms", **size),
-                gain_low=fact(gain_low, "gain from", format=".3f"),
-                gain_high=fact(gain_high, "gain to", format=".3f"),
-                modulus=fact(modulus, "modulus margin", format=".3f"),
-                design=fact(design),
-            )
+    samples = (
+        (problem, family, ends.get(i, level), length, least.gamma_least)
+        for i, level in enumerate(levels.tolist())
+        for family in FAMILIES
+    )
+    yield from evaluate(_front_point, samples, executor)
+
+
+def _front_point(
+    problem: EstimationProblem,
+    family: str,
+    level: float | FilterDesign,
+    taps: int,
+    gamma_least: float,
+) -> Facts:
+    """Design a filter of a norm, unless it is at an end of the front, and examine its loop."""
+    if isinstance(level, FilterDesign):
+        design = level
+    elif family == MIXED.name:
+        design = mixed(problem, gamma=level, taps=taps)
+    else:
+        design = central_filter(problem, gamma=level)
+    margins = None
+    if design.hardware is not None:
+        margins = loop_margins(close_loop(design.hardware, design.controller))
+    names = ("gain_low", "gain_high", "modulus")
+    gain_low, gain_high, modulus = (getattr(margins, name, np.nan) for name in names)
+    deviation = {"unit": "nm", "format": ".2f"}
+    return facts(
+        family=fact(family, "filter"),
+        gamma=fact(design.gamma, "norm", **deviation),
+        gamma_ratio=fact(max(design.gamma / gamma_least, 1.0), "norm / least", format=".4f"),
+        rms=fact(design.rms, "rms", **deviation),
+        gain_low=fact(gain_low, "gain from", format=".3f"),
+        gain_high=fact(gain_high, "gain to", format=".3f"),
+        modulus=fact(modulus, "modulus margin", format=".3f"),
+        design=fact(design),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

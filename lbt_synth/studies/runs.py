@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments, s
 from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
+from lbt_synth.studies.grid import evaluate
 from lbt_synth.validation import FloatArray
 
 
@@ -45,10 +47,12 @@ def run_design(
     frames: int,
     cases: int,
     seed: int,
+    executor: Executor | None = None,
 ) -> DesignRun:
     """Run the loop of a configuration for some frames and cases; sensors may fail on the way.
 
-    A controller that estimates is given the commands that a mirror of this stroke applied.
+    A controller that estimates is given the commands that a mirror of this stroke applied. An
+    executor works on all times between failures at once.
     """
     loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
     loop.require_stable()
@@ -68,9 +72,9 @@ def run_design(
     )
     segments: list[tuple[Segment, Facts]] = []
     if design.other_sensors:
-        for segment in run_segments(drops, frames / loop.hardware.frame_rate_hz):
-            row = _segment_row(design, loop, truth, simulation, segment, config.imaging)
-            segments.append((segment, row))
+        times = run_segments(drops, frames / loop.hardware.frame_rate_hz)
+        samples = ((design, loop, truth, simulation, one, config.imaging) for one in times)
+        segments += zip(times, evaluate(_segment_row, samples, executor), strict=True)
         notes.append("the exact answer is with all sensors.")
     if settle > usual:
         notes.append(

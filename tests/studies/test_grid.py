@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
@@ -11,13 +12,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.plants import LBT_YAML, lbt_axis_plant
 from support.studies import assert_whole, evaluate_quickly, load_small_study, make_folder, part_rows
 
+import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
 from lbt_synth.storage.thread_limits import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.grid import Sweep
+from lbt_synth.studies.grid import Sweep, evaluate
+from lbt_synth.studies.limits import limits
 
 
 def test_a_sweep_knows_what_is_missing(tmp_path):
@@ -45,6 +49,47 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
     assert (computed, counts) == (7, [5, 2, 2, 1, 2])
     assert not begun.exists()  # what a killed process had begun to write
     assert sweep.run(None, lambda rows: rows, part_rows=2)[1] == 0
+
+
+class Elsewhere(ThreadPoolExecutor):
+    """An executor that gets everything in bytes, as one of processes does."""
+
+    def submit(self, fn, /, *args):
+        return super().submit(*pickle.loads(pickle.dumps((fn, *args))))
+
+
+def reciprocal(number, seconds):
+    time.sleep(seconds)
+    return 1 / number
+
+
+def test_answers_in_memory_are_in_the_order_of_their_samples():
+    samples = [(i, 0.05 * (i == 1)) for i in range(1, 9)]
+    with Elsewhere(3) as pool:
+        assert list(evaluate(reciprocal, iter(samples), pool)) == [1 / i for i, _ in samples]
+        with pytest.raises(
+            NumericalError, match=r"rows 1 to 1 .*ZeroDivisionError.*start the stud"
+        ):
+            list(evaluate(reciprocal, [(1, 0.0), (0, 0.0)], pool))
+
+
+def test_tables_of_designs_are_the_same_elsewhere():
+    config = lbt.load_config(LBT_YAML)
+    plant, loop = lbt_axis_plant(modes=1), (config.truth, config.imaging)
+    design, errors = config.design("integrator", gain=0.3), {"errors_hz": [-1.0, 0.0]}
+
+    def tables(**how):
+        yield [
+            str(row.values) for row in lbt.studies.robustness(config.plant, *loop, **errors, **how)
+        ]
+        rows = limits({"slow": design}, config.hardware, *loop, **errors, **how).rows
+        yield [str(row.values) for row in rows]
+        yield [point.gamma for point in lbt.studies.tradeoff(plant, points=2, **how)]
+        gains = {"sensor_gains": np.linspace(0.1, 1, 70), "delay_errors_frames": [0, 0.5]}
+        yield lbt.studies.robustness_map(design, *loop, **errors, **gains, **how).strehl.tolist()
+
+    with Elsewhere(2) as pool:
+        assert list(tables(executor=pool)) == list(tables())
 
 
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):

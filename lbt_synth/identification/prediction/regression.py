@@ -45,10 +45,24 @@ _FIRST = 2
 _REMOTE = 16.0  # frames, from which on a penalty grows with age: old readings tell least
 
 
+def added_noise_nm(model: IdentifiedModel, factor: float) -> float:
+    """Return what makes the noise a multiple, rms over the axes, as phase of each of them [nm]."""
+    noises_nm = [axis.noise_nm / axis.sensor_gain for axis in model.axes]
+    return float(np.sqrt((factor**2 - 1) * np.mean(np.square(noises_nm))))
+
+
 def noisier(model: IdentifiedModel, factor: float) -> IdentifiedModel:
-    """Return a model with a multiple of its noise."""
-    axes = tuple(replace(axis, noise_nm=factor * axis.noise_nm) for axis in model.axes)
-    return replace(model, axes=axes)
+    """Return a model with a multiple of its noise, of which each axis gets the same share.
+
+    What an axis with little noise sees of a shared line steers the others, too: a multiple of its
+    own noise would leave it trusted where they are not.
+    """
+    added_nm = added_noise_nm(model, factor)
+    axes = (
+        replace(axis, noise_nm=float(np.hypot(axis.noise_nm, added_nm * axis.sensor_gain)))
+        for axis in model.axes
+    )
+    return replace(model, axes=tuple(axes))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -277,9 +291,8 @@ def regress(
     scales = np.sqrt(np.mean(changes**2, axis=0))
     moments = [lagged_moments(signals, left, part, TAPS) for part in parts]
     if noise > 1:
-        deviation = np.array([axis.noise_nm for axis in model.axes]) / model.sensor_gains
         drawn = np.random.default_rng(1).standard_normal((count + first, path.modes))
-        drawn *= deviation * np.sqrt(noise**2 - 1)
+        drawn *= added_noise_nm(model, noise)
         silence = np.zeros((len(drawn), beside.shape[1]))
         heard, left, _, target = lay(drawn, ((0, len(drawn)),), silence)
         for place, (a, b) in enumerate(pairwise(edges)):

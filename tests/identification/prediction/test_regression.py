@@ -148,12 +148,14 @@ def test_a_large_penalty_leaves_the_filter_of_the_model() -> None:
 
 
 def test_more_noise_is_trusted_less() -> None:
-    """The command of white noise falls, and the residual rises."""
+    """The command of white noise falls, the residual rises; all axes get the same more noise."""
     _, record, model = vibrating()
     calm, usual = regress(record, model, noise=8.0).design(), predictor(channels=False)
     assert max(calm.claims["command_rms"]) < 0.8 * max(usual.claims["command_rms"])
     assert left_nm2(calm) > left_nm2(usual)
-    assert noisier(model, 8.0).axes[0].noise_nm == 8 * model.axes[0].noise_nm
+    first, second = (replace(model.axes[0], noise_nm=nm, sensor_gain=2.0) for nm in (2.0, 14.0))
+    noises_nm = [axis.noise_nm for axis in noisier(replace(model, axes=(first, second)), 8.0).axes]
+    assert np.square(noises_nm) == pytest.approx(np.array([4, 196]) + 63 * (4 + 196) / 2)
 
 
 def test_gains_and_delays_that_are_not_whole() -> None:
