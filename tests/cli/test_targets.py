@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from support.commands import refuse_commands, run_done, run_json
+from support.commands import run_done, run_json
 from support.compiled import Compiled
 from support.exports import lbt_config
 from support.plants import LBT_YAML
@@ -27,16 +27,6 @@ def test_export_c_at_the_terminal(tmp_path, capsys, gains):
     ours = lbt.load_gain(gains["kalman"]).controller.start()
     theirs = Compiled(out, name="tip", single=True)
     assert np.allclose(theirs.step([1, 2]), ours.step([1, 2]), rtol=1e-6)
-
-
-def test_bad_input(tmp_path, capsys, monkeypatch, gains):
-    monkeypatch.chdir(tmp_path)
-    rows = [
-        ("export GAIN --for matlab -o k.mat --name x", "--name goes with --for c"),
-        ("export GAIN --for cacao -o k.mat", "must end in .fits"),
-    ]
-    refuse_commands(capsys, rows, GAIN=gains["kalman"])
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_record_is_rehearsed_beside_what_ran(tmp_path, capsys):
