@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 from support.plants import ROOT
+from support.refusals import refused
 
 import lbt_synth as lbt
 
-_FOLDERS = (
-    stub.parent.relative_to(ROOT / "lbt_synth") for stub in ROOT.glob("lbt_synth/*/**/*.pyi")
-)
+_STUBS = ROOT.glob("lbt_synth/*/**/*.pyi")
+_FOLDERS = (stub.parent.relative_to(ROOT / "lbt_synth") for stub in _STUBS)
 ROOMS = sorted({"errors", *(".".join(folder.parts) for folder in _FOLDERS)})
 _PAGES = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md"))]
 
@@ -67,8 +67,7 @@ def test_help_is_a_page_with_every_name():
 
 
 def test_a_name_that_is_nowhere_is_refused():
-    with pytest.raises(AttributeError, match="no_such_name"):
-        _ = lbt.no_such_name
+    refused(lambda: lbt.no_such_name, AttributeError, "no_such_name")
     assert not hasattr(lbt, "__wrapped__")
 
 
@@ -76,8 +75,7 @@ def test_a_name_that_is_nowhere_is_refused():
 def test_the_stub_of_a_room_lists_what_is_there(path):
     shown = room(path)
     assert listed(Path(shown.__file__).with_suffix(".pyi")) == set(shown.__all__)
-    for name in shown.__all__:
-        assert getattr(shown, name) is not None
+    assert all(getattr(shown, name) is not None for name in shown.__all__)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -98,11 +96,9 @@ def test_docstrings(name):
 @pytest.mark.parametrize("page", [p for p in _PAGES if ">>> " in (ROOT / p).read_text()])
 def test_examples_on_pages_run(page, monkeypatch):
     monkeypatch.chdir(ROOT)
-    results = doctest.testfile(
-        str(ROOT / page), module_relative=False, optionflags=doctest.ELLIPSIS
-    )
-    assert results.attempted > 0
-    assert results.failed == 0
+    page = str(ROOT / page)
+    results = doctest.testfile(page, module_relative=False, optionflags=doctest.ELLIPSIS)
+    assert (results.attempted > 0, results.failed) == (True, 0)
 
 
 @pytest.mark.parametrize("page", _PAGES)

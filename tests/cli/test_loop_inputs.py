@@ -2,6 +2,7 @@
 
 import pytest
 from support.commands import run_done, run_json
+from support.configs import write_config
 from support.plants import LBT_YAML
 from support.predictors import made
 from support.robust_config import robust_writer
@@ -38,18 +39,17 @@ def test_design_and_show_give_the_residual_in_the_truth(tmp_path, capsys, config
         )  # the second in its model
 
 
-def test_a_residual_that_the_design_does_not_expect_is_a_warning(tmp_path, capsys):
-    gain = tmp_path / "g.fits"
-    still = LBT_YAML.with_name("lbt_robust.yaml")  # its model has no vibration
-    text = run_done(capsys, "design", still, *KALMAN, gain)
-    assert "warning: the truth leaves 776 nm in means over frames, where the design expects" in text
-
-
 def test_an_unstable_loop_in_the_truth_is_told(tmp_path, capsys):
-    path = tmp_path / "loud.yaml"
-    path.write_text(LBT_YAML.read_text().replace("sensor_gain: 1.0 ", "sensor_gain: 3.0 "))
-    out = run_done(capsys, "design", path, *KALMAN, tmp_path / "g.fits")
-    assert out.startswith("The loop is unstable in the truth of loud.yaml.")
+    """And so is a residual that the design does not expect: its model has no vibration."""
+    loud = LBT_YAML.read_text().replace("sensor_gain: 1.0 ", "sensor_gain: 3.0 ")
+    for file, words in (
+        (write_config(tmp_path, loud), "The loop is unstable in the truth of c.yaml."),
+        (
+            LBT_YAML.with_name("lbt_robust.yaml"),
+            "warning: the truth leaves 776 nm in means over frames, where the design expects",
+        ),
+    ):
+        assert words in run_done(capsys, "design", file, *KALMAN, tmp_path / "g.fits")
 
 
 def test_a_predictor_says_what_accelerometers_buy(tmp_path, capsys):
@@ -79,3 +79,8 @@ def test_a_demand_that_costs_residual_is_named(tmp_path, capsys):
     better = [line for line in text.splitlines() if "leaves less in the truth" in line]
     assert better
     assert all("it violates: modulus margin of at least 0.8" in line for line in better)
+    shown = run_json(capsys, "show", gain)  # as other commands do
+    assert (shown["method"], len(shown["terms"]), 0 < shown["loss"] < 0.1) == ("robust", 3, True)
+    assert run_json(capsys, "verify", gain)["passed"] is True
+    run_done(capsys, "plot", "sigma", gain)
+    run_done(capsys, "simulate", path, gain, "--frames", 500, "--cases", 1)

@@ -14,6 +14,7 @@ from support.configs import minimal_config, write_config
 from support.drifting import drift_file
 from support.plants import LBT_YAML
 from support.predictors import made
+from support.refusals import refused
 
 import lbt_synth as lbt
 from lbt_synth.cli import main as command_line
@@ -161,14 +162,14 @@ def test_a_refusal_is_one_line_and_writes_nothing(tmp_path, capsys, monkeypatch,
     assert os.listdir() == []
 
 
-def test_the_package_runs_as_a_module():
-    done = subprocess.run(
-        [sys.executable, "-m", "lbt_synth", "--version"], capture_output=True, text=True, check=True
-    )
-    assert done.stdout == f"lbt-synth {lbt.__version__}\n"
+def python(*words):
+    """Return what a fresh interpreter prints."""
+    options = {"capture_output": True, "text": True, "check": True}
+    return subprocess.run([sys.executable, *words], **options).stdout
 
 
-def test_no_words_are_a_question_for_help(capsys):
+def test_the_package_runs_as_a_module_and_no_words_are_a_question_for_help(capsys):
+    assert python("-m", "lbt_synth", "--version") == f"lbt-synth {lbt.__version__}\n"
     assert run(capsys) == run(capsys, "--help")
 
 
@@ -196,34 +197,26 @@ def test_shells_complete_every_option():
 
 def loaded_after(code):
     """Modules in memory after a fresh interpreter ran some code."""
-    script = f"{code}\nimport sys\nprint('\\n'.join(sys.modules))"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    return set(done.stdout.split())
+    return {*python("-c", f"{code}\nimport sys\nprint('\\n'.join(sys.modules))").split()}
 
 
-@pytest.mark.parametrize(
-    "code",
-    [
-        "import lbt_synth",
-        "from lbt_synth.cli.arguments import build_parser; build_parser('').format_help()",
-    ],
-)
-def test_imports_are_quick(code):
+def test_imports_are_quick():
     """Nothing heavier than the standard library before a name is used."""
     heavy = {"cvxpy", "control", "matplotlib", "astropy", "scipy"}
     heavy |= {"pydantic", "rich", "numpy", "bokeh", "jinja2"}
-    assert not heavy & loaded_after(code)
+    arguments = "from lbt_synth.cli.arguments import build_parser; build_parser('').format_help()"
+    for code in ("import lbt_synth", arguments):
+        assert not heavy & loaded_after(code)
 
 
 @pytest.mark.parametrize("method", ["kalman", "hinf"])
 def test_a_design_of_one_sensor_loads_what_it_uses(tmp_path, method):
     """What a design does not need took half of its time."""
-    ours = "design.loop_shaping design.modal design.shaping.solution design.mixed design.lqg "
-    ours += "linear.output_feedback loop.simulation interop config.end_to_end studies.study "
-    ours += "studies.robustness report.figures report.page identification.fit "
-    ours += "identification.records"
+    ours = (
+        "design.loop_shaping design.modal design.shaping.solution design.mixed design.lqg interop "
+        "linear.output_feedback loop.simulation config.end_to_end studies.study identification.fit "
+        "studies.robustness report.figures report.page identification.records"
+    )
     unused = {f"lbt_synth.{name}" for name in ours.split()} | {"scipy.stats", "scipy.signal"}
     unused |= {"control", "matplotlib", "bokeh", "jinja2", "weasyprint"}
     if method == "hinf":  # its inequalities are stated in cvxpy
@@ -243,8 +236,7 @@ def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(monkeypatc
         monkeypatch.setenv(name, "3")
         if threads is None:
             monkeypatch.delenv(name)
-        with pytest.raises(SystemExit):
-            command_line.entry_point()
+        refused(command_line.entry_point, SystemExit, None)
         assert os.environ.get(name) == threads
     assert seen == ["3", "1"]
 
@@ -256,5 +248,5 @@ def test_the_console_script_survives_a_closed_pipe():
 
 
 def test_in_python_arguments_keep_their_names(config):
-    with pytest.raises(lbt.errors.InfeasibleError, match=r"must be .* Try gamma_ratio=1\.2\."):
-        lbt.hinf(config.plant, gamma=1.0)
+    words = r"must be .* Try gamma_ratio=1\.2\."
+    refused(lambda: lbt.hinf(config.plant, gamma=1.0), lbt.errors.InfeasibleError, words)

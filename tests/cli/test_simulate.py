@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from support.commands import run_done, run_json
+from support.configs import write_config
 from support.drifting import drift_file
 from support.plants import LBT_YAML
 from support.refusals import refused
-from support.several_sensors import CONFIG as SEVERAL_SENSORS
-from support.several_sensors import write_config
 
 import lbt_synth as lbt
 from lbt_synth.cli.simulate import tiptop_spectrum
@@ -98,7 +97,8 @@ def test_what_shows_a_design_of_several_sensors(tmp_path, capsys, sensors_config
     assert re.search(r"^ +sensors +37\.40 ", text, re.MULTILINE)
     beside = "runs with the sensors of the gain file beside the loop's own"
     assert beside not in text
-    noisy = SEVERAL_SENSORS.replace("noise_m_s2: 2.0e-4", "noise_m_s2: 2.0e-2")
+    source = sensors_config.source.read_text()
+    noisy = source.replace("noise_m_s2: 2.0e-4", "noise_m_s2: 2.0e-2")
     words = ("simulate", write_config(tmp_path, noisy), sensors_file, "--frames", 500)
     assert beside in run_done(capsys, *words)  # other sensors than those of the configuration
     text = run_done(capsys, "tradeoff", sensors_config.source, "--points", 2, "--taps", 2)

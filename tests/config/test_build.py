@@ -6,7 +6,6 @@ from support.configs import AR, OTHER, SMALL, change_key, minimal_config, write_
 from support.drifting import drift_file
 from support.plants import LBT_YAML, ROOT
 from support.refusals import refused
-from support.several_sensors import CONFIG as SENSORS
 
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError
@@ -32,21 +31,23 @@ def edited(source, old, new):
 def test_every_kind_of_turbulence_noise_and_direction(tmp_path, config):
     given = {"kind": "ar", "coefficients": [0.9, 0.05], "driving_rms_nm": 3.0}
     line = {"direction_deg": 30.0, "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 5.0}
-    ar, mas, turned, calm = (
-        load(tmp_path, change_key(path, value))
-        for path, value in (
-            (("model", "turbulence"), given),
-            (("sensor",), {"noise_mas": 2.0}),
-            (("model", "vibrations"), [line]),
-            (("model", "vibrations"), ...),
-        )
+    ar, mas, turned = (
+        load(tmp_path, change_key(path.split("."), value))
+        for path, value in {
+            "model.turbulence": given,
+            "sensor": {"noise_mas": 2.0},
+            "model.vibrations": [line],
+        }.items()
     )
     assert ar.plant.turbulence[0].coefficients.tolist() == [0.9, 0.05]
     assert mas.noise_nm == pytest.approx(2 * lbt.models.nm_per_mas(8.22))
     (direction,) = (vibration.direction for vibration in turned.plant.vibrations)
     assert direction == pytest.approx((np.cos(np.pi / 6), np.sin(np.pi / 6)))
     assert [v.direction for v in config.plant.vibrations] == [(1.0, 0.0), (0.0, 1.0)]
+    calm = load(tmp_path, change_key(("model", "vibrations"), ...))
     assert calm.plant.vibrations == ()
+    (drift,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
+    assert drift == SinusoidalVibration(frequency_hz=17, end_hz=23, duration_s=60, rms_nm=797)
 
 
 def test_no_telescope_and_no_atmosphere(tmp_path, config):
@@ -85,18 +86,13 @@ def test_ar2_is_fitted_above_the_noise_of_its_axis(tmp_path, air):
     assert (first[0], *second) == (pytest.approx(0.98860, abs=5e-6), 0.99)
 
 
-@pytest.mark.parametrize("direction", [{}, {"axis": "tip"}])
-def test_one_axis(tmp_path, direction):
-    line = {"frequency_hz": 20.0, "damping": 0.01, "rms_nm": 300.0, **direction}
-    config = load_minimal(tmp_path, loop={"axes": 1}, model={"vibrations": [line]})
-    assert (config.hardware.modes, config.plant.vibrations[0].direction) == (1, (1.0,))
+def test_one_axis(tmp_path):
     both = lbt.kalman(load_minimal(tmp_path, loop={"axes": 2}).plant)  # of which it is tip
-    assert lbt.kalman(config.plant).rms == pytest.approx(both.certificate.rms_per_output[0])
-
-
-def test_a_line_may_drift(tmp_path):
-    (drift,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
-    assert drift == SinusoidalVibration(frequency_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    for direction in ({}, {"axis": "tip"}):
+        line = {"frequency_hz": 20.0, "damping": 0.01, "rms_nm": 300.0, **direction}
+        config = load_minimal(tmp_path, loop={"axes": 1}, model={"vibrations": [line]})
+        assert (config.hardware.modes, config.plant.vibrations[0].direction) == (1, (1.0,))
+        assert lbt.kalman(config.plant).rms == pytest.approx(both.certificate.rms_per_output[0])
 
 
 def test_priors_of_a_configuration(tmp_path, config):
@@ -144,18 +140,21 @@ def test_frequency_errors_of_each_line(tmp_path, lines, errors, widest):
 
 
 def test_a_file_describes_its_sensors(sensors_config, tmp_path):
-    plant = sensors_config.plant
+    plant, text = sensors_config.plant, sensors_config.source.read_text()
     assert plant.hardware.suite.units == ("wavefront", "slow", "m1", "m2")
     assert plant.period == 2
     assert plant.read.tolist() == [[True] * 6, [True, True, False, False, True, True]]
     assert plant.motions[1]["m2"].phase_deg == 150
     assert sensors_config.truth.motions == plant.motions
+    own = sensors_config.design("integrator", gain=0.3)  # which leaves the others out
+    assert own.controller.D.shape == (2, 2)
+    assert own.assumptions == ("the loop's own sensor is read alone, without slow, m1, m2",)
     line = "axis: tip, kind: sinusoid, frequency_hz: 21, rms_nm: 400"
     moved = f"truth: {{vibrations: [{{{line}, accelerometers: {{m1: {{motion_nm_per_nm: 3}}}}}}]}}"
     spread = "frequency_hz: 20, spread_hz: 1, lines: 3, damping: 0.01"
     covariance = "covariance: [[4.0e-8, 2.0e-8], [2.0e-8, 4.0e-8]]"
     named, many, noisy = (
-        load(tmp_path, edited(SENSORS, old, new))
+        load(tmp_path, edited(text, old, new))
         for old, new in (
             ("truth: {vibrations: model}", moved),
             ("frequency_hz: 20, damping: 0.01", spread),
@@ -166,12 +165,6 @@ def test_a_file_describes_its_sensors(sensors_config, tmp_path):
     assert list(map(sorted, many.plant.motions)) == [["m1"], ["m1"], ["m1"], ["m2"]]
     factor = noisy.plant.hardware.suite.accelerometers[0].noise_factor(2)
     assert np.allclose(factor @ factor.T, [[4e-8, 2e-8], [2e-8, 4e-8]])
-
-
-def test_methods_for_the_own_sensor_leave_the_others_out(sensors_config):
-    design = sensors_config.design("integrator", gain=0.3)
-    assert design.controller.D.shape == (2, 2)
-    assert design.assumptions == ("the loop's own sensor is read alone, without slow, m1, m2",)
 
 
 LINE, BANDWIDTH, GAIN = (
@@ -213,15 +206,16 @@ CHANNELS = "channels: [m1, m2]"
         (SLOW, BANDWIDTH, f"{GAIN}\n    derivative_per_s: 800.0", "damping goes with bandwidth_hz"),
         (SLOW, "frame_rate_hz: 800.0", "frame_rate_hz: 990.0", "986.30137 and 1000 Hz"),
         (SLOW, "delay_samples: 1", "delay_samples: 1.5", "mirror.local_loop.delay_samples"),
-        (SENSORS, CHANNELS, "channels: [m1, wavefront]", "different names"),
-        (SENSORS, CHANNELS, "channels: [m1]", "names the channel 'm2'"),
-        (SENSORS, "noise_m_s2: 2.0e-4", "noise_nm: 2", "goes with kind: wavefront"),
-        (SENSORS, ", noise_nm: 20}", "}", "exactly one of noise_nm, noise_m_s2, covariance"),
-        (SENSORS, f"{CHANNELS}, ", "", "channels is missing"),
-        (SENSORS, "{rate_hz: 500, delay", "{rate: 500, delay", "unknown key sensors.slow.rate"),
+        (None, CHANNELS, "channels: [m1, wavefront]", "different names"),
+        (None, CHANNELS, "channels: [m1]", "names the channel 'm2'"),
+        (None, "noise_m_s2: 2.0e-4", "noise_nm: 2", "goes with kind: wavefront"),
+        (None, ", noise_nm: 20}", "}", "exactly one of noise_nm, noise_m_s2, covariance"),
+        (None, f"{CHANNELS}, ", "", "channels is missing"),
+        (None, "{rate_hz: 500, delay", "{rate: 500, delay", "unknown key sensors.slow.rate"),
     ],
 )
-def test_what_does_not_go_together_is_refused(tmp_path, source, old, new, words):
-    """By the file, or by the end-to-end simulation that it describes."""
+def test_what_does_not_go_together_is_refused(tmp_path, sensors_config, source, old, new, words):
+    """By the file (None is that of several sensors), or by its end-to-end simulation."""
+    source = source or sensors_config.source.read_text()
     file = write_config(tmp_path, edited(source, old, new))
     refused(lambda: lbt.load_config(file).end_to_end, ConfigError, words)

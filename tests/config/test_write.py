@@ -77,15 +77,14 @@ def load_identified(tmp_path, model, **options):
     return lbt.load_config(save_identified(tmp_path, model, **options))
 
 
-@pytest.mark.parametrize("name", ["lbt.yaml", "lbt_robust.yaml", "lbt_slow_mirror.yaml"])
-def test_the_examples_are_written_as_they_are(tmp_path, name):
-    before = lbt.load_config(ROOT / "examples" / name)
-    (tmp_path / name).write_text(config_text(before.settings))
-    after = lbt.load_config(tmp_path / name)
-    assert after.settings == before.settings
-    assert after.settings.model_fields_set == before.settings.model_fields_set
-    np.testing.assert_array_equal(after.plant.A, before.plant.A)
-    assert after.truth.vibrations == before.truth.vibrations
+def test_the_examples_are_written_as_they_are(tmp_path):
+    for name in ("lbt.yaml", "lbt_robust.yaml", "lbt_slow_mirror.yaml"):
+        before = lbt.load_config(ROOT / "examples" / name)
+        after = lbt.load_config(write_config(tmp_path, config_text(before.settings)))
+        assert after.settings == before.settings
+        assert after.settings.model_fields_set == before.settings.model_fields_set
+        np.testing.assert_array_equal(after.plant.A, before.plant.A)
+        assert after.truth.vibrations == before.truth.vibrations
 
 
 positive, finite = st.floats(0.1, 100.0), st.floats(-1e4, 1e4)
@@ -147,10 +146,10 @@ def test_a_line_of_both_axes_is_written_once_with_its_direction(tmp_path):
     share = replace(line, rms_nm=60 * np.cos(angle))  # of tip: no line of its own
     model = replace(TWO, axes=(replace(TIP, parts=(share, *TIP.parts)), TILT), shared=(line,))
     file = save_identified(tmp_path, model)
-    made = lbt.load_config(file).plant.vibrations
+    *_, shared = made = lbt.load_config(file).plant.vibrations
     assert [one.frequency_hz for one in made] == [20.123456789, 47.0, 13.7, 31.0]
-    assert made[-1].direction == pytest.approx(line.direction, abs=1e-15)
-    assert made[-1].rms_nm == 60
+    assert shared.direction == pytest.approx(line.direction, abs=1e-15)
+    assert shared.rms_nm == 60
     (row,) = [row for row in file.read_text().splitlines() if "direction_deg" in row]
     assert float(row.split("#")[0].split(":")[1]) == pytest.approx(-34.2)
     assert row.endswith("# standard error 0.8 degrees")
@@ -160,15 +159,13 @@ def test_drifts_and_bumps_are_written(tmp_path):
     """A drift was refused after the fit: its damping ratio is far above 1."""
     drift = Line(frequency_hz=18.0, damping=300.0, rms_nm=50.0)
     bump = Line(frequency_hz=42.0, damping=0.17, rms_nm=30.0, sections=4)
-    model = Model(axes=(replace(TIP, parts=(drift, bump)),))
-    made = load_identified(tmp_path, model)
-    lines = [(line.damping, line.sections) for line in made.plant.vibrations]
-    assert lines == [(300, 1), (0.17, 4)]
-    assert made.truth.vibrations == made.plant.vibrations
-    assert lbt.kalman(made.plant).certificate.passed
     calm = Model(axes=(replace(TIP, parts=()), replace(TILT, parts=())))
-    config = load_identified(tmp_path, calm)
-    assert config.plant.vibrations == config.truth.vibrations == ()
+    moved = Model(axes=(replace(TIP, parts=(drift, bump)),))
+    for model, expected in ((calm, []), (moved, [(300, 1), (0.17, 4)])):
+        made = load_identified(tmp_path, model)
+        assert [(line.damping, line.sections) for line in made.plant.vibrations] == expected
+        assert made.truth.vibrations == made.plant.vibrations
+    assert lbt.kalman(made.plant).certificate.passed
 
 
 def test_standard_errors_stand_beside_their_numbers(tmp_path):
@@ -182,9 +179,6 @@ def test_standard_errors_stand_beside_their_numbers(tmp_path):
         assert words in text
     # a gain of 1 that was not estimated is not worth a key
     assert "sensor_gain" not in save_identified(tmp_path, ONE_AXIS).read_text()
-
-
-def test_a_telescope_is_written_where_it_is_known(tmp_path):
     camera = {"diameter_m": 8.22, "obstruction": 0.11, "wavelength_um": 1.65}
     imaging = load_identified(tmp_path, TWO, **camera, other_modes_strehl=0.8).imaging
     stated = camera | {"other_modes": 0.8}
