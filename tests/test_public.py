@@ -26,7 +26,6 @@ def room(path):
 
 
 def public_names(path):
-    """Names that a room shows, without its folders."""
     if path == "errors":
         return sorted(name for name in vars(room(path)) if name.endswith("Error"))
     return sorted(n for n in room(path).__all__ if not inspect.ismodule(getattr(room(path), n)))

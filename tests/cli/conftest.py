@@ -21,7 +21,6 @@ def recorded_loop():
 
 @pytest.fixture(scope="session")
 def recorded_night(recorded_loop, tmp_path_factory):
-    """The telemetry of that loop."""
     simulation, path, _ = recorded_loop
     seen = lbt.files.telemetry_from_simulation(simulation, path, sensor_gain=GAIN)
     return lbt.files.save_telemetry(tmp_path_factory.mktemp("night") / "night.fits", seen)

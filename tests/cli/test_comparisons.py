@@ -92,11 +92,15 @@ def test_frame_rates_are_those_of_the_mirrors_local_loop(capsys, monkeypatch):
     assert rates == pytest.approx([700, 798, 910], rel=0.01)
 
 
-def test_tradeoff(tmp_path, capsys):
+def test_tradeoff_and_mirror(tmp_path, capsys):
     data = written(capsys, tmp_path, "tradeoff", LBT_YAML, "--points", 2, key="points")
     columns = "family gamma gamma_ratio rms gain_low gain_high modulus"
     assert list(data["points"][0]) == columns.split()
     assert data["gamma_infeasible"] < data["gamma_least"] == pytest.approx(155.803, abs=1e-3)
+    few = write_config(tmp_path, with_errors(SLOW_YAML.read_text(), 0))
+    data = written(capsys, tmp_path, "mirror", few)
+    assert [row["stable"] for row in data["rows"]] == [True, False, True, True]
+    assert data["settling_s"] > 3e-3
 
 
 def test_command_with_gain_files(tmp_path, capsys, gains, config):
@@ -160,13 +164,6 @@ def test_compare(tmp_path, capsys, gains, config):
     text = run_done(capsys, "compare", loud, *words)
     assert text.startswith("hinf is unstable in the truth. kalman leaves ")
     assert re.search(r"hinf +unstable", text)
-
-
-def test_the_mirror_settles(tmp_path, capsys):
-    few = write_config(tmp_path, with_errors(SLOW_YAML.read_text(), 0))
-    data = written(capsys, tmp_path, "mirror", few)
-    assert [row["stable"] for row in data["rows"]] == [True, False, True, True]
-    assert data["settling_s"] > 3e-3
 
 
 @pytest.mark.parametrize("pyramid", [True, False])

@@ -41,7 +41,6 @@ def test_an_error_is_a_status_and_a_line(capsys, monkeypatch, more):
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory, gains, recorded_night, recorded_loop, sensors_config, sensors_file):
-    """Files that refusals name."""
     folder = tmp_path_factory.mktemp("places")
     lbt_text, rows = LBT_YAML.read_text(), "1.0,2.0,0.5,0.25\n2.0,1.0,0.25,0.5\n" * 100
     noise = re.sub(r"(?s)  pyramid:.*?(?=mirror:)", "  noise_nm: [12.0, 9.0]\n\n", lbt_text)
@@ -163,7 +162,6 @@ def test_a_refusal_is_one_line_and_writes_nothing(tmp_path, capsys, monkeypatch,
 
 
 def python(*words):
-    """Return what a fresh interpreter prints."""
     options = {"capture_output": True, "text": True, "check": True}
     return subprocess.run([sys.executable, *words], **options).stdout
 
@@ -196,7 +194,6 @@ def test_shells_complete_every_option():
 
 
 def loaded_after(code):
-    """Modules in memory after a fresh interpreter ran some code."""
     return {*python("-c", f"{code}\nimport sys\nprint('\\n'.join(sys.modules))").split()}
 
 

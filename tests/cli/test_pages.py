@@ -1,7 +1,5 @@
 """The commands plot, report and explore: their files, their output, and their errors."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

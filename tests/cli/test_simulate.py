@@ -76,7 +76,6 @@ def test_the_commands_simulate_it_or_refuse(tmp_path, capsys):
 
 
 def test_sensors_that_fail_on_the_way(tmp_path, capsys, sensors_config, sensors_file):
-    """The run reaches beyond the last event."""
     drops = ("--drop", "m2@0.2s", "--drop", "wavefront@0.5s..0.7s:frozen", "--cases", 1)
     words = ("simulate", sensors_config.source, sensors_file, *drops)
     data = run_json(capsys, *words)

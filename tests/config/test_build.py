@@ -48,12 +48,9 @@ def test_every_kind_of_turbulence_noise_and_direction(tmp_path, config):
     assert calm.plant.vibrations == ()
     (drift,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
     assert drift == SinusoidalVibration(frequency_hz=17, end_hz=23, duration_s=60, rms_nm=797)
-
-
-def test_no_telescope_and_no_atmosphere(tmp_path, config):
-    small = load(tmp_path, SMALL)
+    small = load(tmp_path, SMALL)  # no telescope and no atmosphere
     assert (small.atmosphere, small.imaging.diameter_m) == (None, None)
-    assert small.truth.turbulence is small.plant.turbulence[0]  # the model, without an atmosphere
+    assert small.truth.turbulence is small.plant.turbulence[0]
     kinds = [each.settings.true_turbulence for each in (small, config)]
     assert kinds == ["model", "frozen_flow"]
 
@@ -115,20 +112,17 @@ def test_the_example_has_a_mirror_for_design_and_loop(tmp_path):
 
 
 FAST = {"kind": "sinusoid", "frequency_hz": 40.0, "rms_nm": 50, "axis": "tip"}
+KNOWN = {"frequency_error_hz": 0}
 BOTH = {"kind": "sinusoid", "frequency_hz": 0.3, "rms_nm": 400, "axis": "both"}  # one on each axis
-
-
-def stated(line, error_hz):
-    return line | {"frequency_error_hz": error_hz}
 
 
 @pytest.mark.parametrize(
     ("lines", "errors", "widest"),
     [
         ([BOTH, FAST], None, 3.5),
-        ([stated(BOTH, 0), stated(FAST, 2)], (0, 0, 2), 2.0),
-        ([BOTH, stated(FAST, 1.0)], (0, 0, 1), 1.0),
-        ([stated(BOTH, 0), stated(FAST, 0)], (0, 0, 0), 0.0),
+        ([BOTH | KNOWN, FAST | {"frequency_error_hz": 2}], (0, 0, 2), 2.0),
+        ([BOTH, FAST | {"frequency_error_hz": 1.0}], (0, 0, 1), 1.0),
+        ([BOTH | KNOWN, FAST | KNOWN], (0, 0, 0), 0.0),
         ([BOTH], None, 0.175 * 0.3),  # a slow line alone has small errors
         ([], None, 0.0),
     ],

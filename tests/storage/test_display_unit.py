@@ -1,7 +1,5 @@
 """Wavefronts in the unit that people want to see."""
 
-from __future__ import annotations
-
 import pytest
 from support.refusals import refused
 

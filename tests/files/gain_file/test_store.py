@@ -100,8 +100,6 @@ def scale_gain(document):
 
 
 def changed(*keys, **changes):
-    """Update a branch of a document."""
-
     def change(document):
         functools.reduce(lambda branch, key: branch[key], keys, document).update(changes)
 
@@ -253,20 +251,6 @@ def without_notes(value):
     return [without_notes(each) for each in value] if isinstance(value, list | tuple) else value
 
 
-def difference(one, other):
-    """Say whether two designs are the same but for notes, or another word beside equal claims."""
-    one, other = record_design(one), record_design(other)
-    equal = one.arrays.keys() == other.arrays.keys() and all(
-        np.shape(array) == np.shape(other.arrays[name])
-        and np.allclose(array, other.arrays[name], rtol=1e-12, atol=0)
-        for name, array in one.arrays.items()
-    )
-    if not equal or one.meta["claims"] != other.meta["claims"]:
-        return "another design"
-    same = without_notes(one.meta) == without_notes(other.meta)
-    return "the same design" if same else "another word"
-
-
 def outcome(name, parts, place, new, path):
     """Say what comes of a file of which one field was changed and the digest written again."""
     document = copy.deepcopy(parts)
@@ -286,8 +270,16 @@ def outcome(name, parts, place, new, path):
         return "refused" if "\n" not in str(error) else "refused in many lines"
     if not back.recertify().passed:
         return "refused"
-    kind = difference(back, original(name))
-    return f"{kind}: {place[-1]}" if kind == "another word" else kind
+    one, other = record_design(original(name)), record_design(back)
+    equal = one.arrays.keys() == other.arrays.keys() and all(
+        np.shape(array) == np.shape(other.arrays[key])
+        and np.allclose(other.arrays[key], array, rtol=1e-12, atol=0)
+        for key, array in one.arrays.items()
+    )
+    if not equal or one.meta["claims"] != other.meta["claims"]:
+        return "another design"
+    same = without_notes(one.meta) == without_notes(other.meta)
+    return "the same design" if same else f"another word: {last}"
 
 
 def outcomes(name, count, folder):
@@ -321,7 +313,6 @@ def test_no_edit_of_some_is_taken_for_another_design(tmp_path, name):
 @pytest.mark.study
 @pytest.mark.parametrize("name", ORIGINALS)
 def test_no_edit_is_taken_for_another_design(tmp_path, name, capsys):
-    """The rows of the table of docs/gain_file.md."""
     counts = outcomes(name, 180, tmp_path)
     with capsys.disabled():
         row = [counts[kind] for kind in ("refused", "the same design", "cannot be written")]

@@ -45,10 +45,8 @@ def test_any_telemetry_comes_back(tmp_path, seen, ending):
 )
 def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, mirror, name):
     """What the file says of timing is checked on a simulation without noise."""
-    matrices = {
-        "sensor_matrix": np.random.default_rng(3).standard_normal((3, 2)),
-        "influence_matrix": [[1.0, 0.2], [-0.1, 0.8]],
-    }
+    sensor = np.random.default_rng(3).standard_normal((3, 2))
+    matrices = {"sensor_matrix": sensor, "influence_matrix": [[1.0, 0.2], [-0.1, 0.8]]}
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, mirror=mirror, **matrices)
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
     truth = lbt.Truth(turbulence=slow, noise_nm=0.0, sensor_gain=0.6)
@@ -84,19 +82,6 @@ def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, mirror, name
     assert np.allclose(again.residual_nm, run.residual_nm, rtol=0, atol=1e-9)
 
 
-def edited(tmp_path, change, *, resign=True):
-    """Write a file whose arrays and metadata somebody changed."""
-    arrays, meta = store.pack(full())
-    arrays = {name: np.array(array) for name, array in arrays.items()}
-    meta["digest"] = archive.digest(arrays, meta)
-    change(arrays, meta)
-    if resign:
-        meta["digest"] = archive.digest(arrays, meta)
-    path = tmp_path / "t.npz"
-    path.write_bytes(archive.npz_bytes(arrays, json.dumps(meta)))
-    return path
-
-
 LAYOUT = "layout version 9, of lbt_synth .*; this version reads 2. Try another copy"
 DIGEST = "does not match its digest"
 
@@ -119,12 +104,18 @@ DIGEST = "does not match its digest"
     ],
 )
 def test_edited_files_are_refused(tmp_path, change, text):
-    path = edited(tmp_path, change, resign=text != DIGEST)
+    arrays, meta = store.pack(full())
+    arrays = {name: np.array(array) for name, array in arrays.items()}
+    meta["digest"] = archive.digest(arrays, meta)
+    change(arrays, meta)
+    if text != DIGEST:
+        meta["digest"] = archive.digest(arrays, meta)
+    path = tmp_path / "t.npz"
+    path.write_bytes(archive.npz_bytes(arrays, json.dumps(meta)))
     refused(lambda: load_telemetry(path), TelemetryError, text)
 
 
 def test_the_fits_file_explains_itself(tmp_path):
-    """Read with astropy alone: names, units, axes, timing."""
     seen = full()
     with fits.open(save_telemetry(tmp_path / "t.fits", seen)) as units:
         headers = {unit.name: unit.header for unit in units}
@@ -145,36 +136,37 @@ def test_the_fits_file_explains_itself(tmp_path):
 def test_the_camera_gives_telescope_and_strehl_ratio():
     shake = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=200)
     camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
-
-    def run(path, **size):
-        truth = lbt.Truth(turbulence=None, vibrations=(shake,) if path.modes == 2 else ())
-        return lbt.simulate(lbt.integrator(path, gain=0.5), truth, hardware=path, **size)
-
     path, three = (lbt.LoopHardware(frame_rate_hz=800, modes=modes) for modes in (2, 3))
-    ran = run(path, frames=200, cases=2)
+    design, truth = lbt.integrator(path, gain=0.5), lbt.Truth(turbulence=None, vibrations=(shake,))
+    ran = lbt.simulate(design, truth, hardware=path, frames=200, cases=2)
     seen = telemetry_from_simulation(ran, path, case=1, imaging=camera, metadata={"b": 1})
     assert dict(seen.metadata) == {"b": 1, "seed": 0, "strehl": ran.strehl(camera)[1]}
     assert (seen.diameter_m, seen.obstruction, seen.imaging_wavelength_um) == (8.22, 0.11, 2.2)
-    wide = telemetry_from_simulation(run(three, frames=5), three, imaging=camera)
-    assert "strehl" not in wide.metadata
+    calm, design = lbt.Truth(turbulence=None), lbt.integrator(three, gain=0.5)
+    wide = lbt.simulate(design, calm, hardware=three, frames=5)
+    assert "strehl" not in telemetry_from_simulation(wide, three, imaging=camera).metadata
 
 
-def test_what_is_no_simulation_is_refused(axis_plant):
-    path, control = axis_plant.hardware, lbt.kalman(axis_plant).controller
-    run = lbt.simulate(control, lbt.Truth(turbulence=None), hardware=path, frames=5)
-    other, two = (lbt.LoopHardware(frame_rate_hz=f, modes=m) for f, m in ((500, 1), (800, 2)))
+def test_what_is_no_simulation_is_refused():
+    path, other, two = (
+        lbt.LoopHardware(frame_rate_hz=hz, modes=m) for hz, m in ((800, 1), (500, 1), (800, 2))
+    )
+    design = lbt.integrator(path, gain=0.5)
+    run = lbt.simulate(design, lbt.Truth(turbulence=None), hardware=path, frames=5)
 
     def telemetry(run=run, path=path, **options):
         return lambda: telemetry_from_simulation(run, path, **options)
 
-    size = "interaction_matrix must have 1 measurement to match measurements"
-    require_refusals(
-        [
-            (telemetry(case=1), ProblemError, "case must be below the number of cases, 1; got 1"),
-            (telemetry(path=other), ProblemError, "must be that of the simulation, at 800 Hz"),
-            (telemetry(3), ProblemError, "expected a Simulation; got int"),
-            (telemetry(path=3), ProblemError, "expected a LoopHardware; got int"),
-            (telemetry(path=two), DimensionError, size),
-            (lambda: save_telemetry("t.fits", 3), OutputError, "got int"),
-        ]
-    )
+    rows = [
+        (telemetry(case=1), ProblemError, "case must be below the number of cases, 1; got 1"),
+        (telemetry(path=other), ProblemError, "must be that of the simulation, at 800 Hz"),
+        (telemetry(3), ProblemError, "expected a Simulation; got int"),
+        (telemetry(path=3), ProblemError, "expected a LoopHardware; got int"),
+        (
+            telemetry(path=two),
+            DimensionError,
+            "interaction_matrix must have 1 measurement to match",
+        ),
+        (lambda: save_telemetry("t.fits", 3), OutputError, "got int"),
+    ]
+    require_refusals(rows)

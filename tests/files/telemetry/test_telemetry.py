@@ -52,7 +52,6 @@ from lbt_synth.errors import ProblemError
     ],
 )
 def test_what_does_not_fit_is_refused(changes, text):
-    """The last two by the hardware that they would describe."""
     refused(lambda: full(**changes).hardware, ProblemError, text)
 
 
