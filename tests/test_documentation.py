@@ -2,11 +2,12 @@
 
 import ast
 import importlib
-import importlib.util
 import inspect
 import re
+import runpy
 import shutil
 import tomllib
+from types import SimpleNamespace
 
 import pytest
 from ruamel.yaml import YAML
@@ -38,14 +39,11 @@ def prose(text):
 
 @pytest.mark.parametrize("page", [*PAGES, *NOTES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_prose_is_plain_and_no_line_is_longer_than_100(page):
-    lines = prose(page.read_text(encoding="utf-8"))
+    text = page.read_text(encoding="utf-8")
+    lines = prose(text)
+    assert len(text.splitlines()) <= 120 or "decisions" not in page.parts  # what holds today
     assert [line for line in lines if len(line) > 100] == []
     assert NOT_ENGLISH.findall(" ".join(lines)) == []
-
-
-def test_a_page_of_decisions_says_what_holds_today_in_120_lines():
-    for page in ROOT.glob("docs/decisions/*.md"):
-        assert len(page.read_text(encoding="utf-8").splitlines()) <= 120, page
 
 
 def test_the_citation_is_of_this_version_and_goes_into_the_source_archive():
@@ -57,10 +55,7 @@ def test_the_citation_is_of_this_version_and_goes_into_the_source_archive():
 
 @pytest.fixture(scope="module")
 def house():
-    spec = importlib.util.spec_from_file_location("house", ROOT / "docs" / "house.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(ROOT / "docs" / "house.py"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -49,13 +49,15 @@ def listed(stub):
     }
 
 
-def test_the_face_has_at_most_forty_four_names():
+def test_the_face_has_at_most_forty_four_names_and_no_other():
     assert len(FACE) <= 44
     assert listed(Path(lbt.__file__).with_suffix(".pyi")) == set(FACE)
     for name in FACE:
         thing = getattr(lbt, name)
         if not inspect.ismodule(thing):  # and is one that its room shows
             assert any(thing is public(other) for other in NAMES), name
+    refused(lambda: lbt.no_such_name, AttributeError, "no_such_name")
+    assert not hasattr(lbt, "__wrapped__")
 
 
 def test_help_is_a_page_with_every_name():
@@ -63,11 +65,6 @@ def test_help_is_a_page_with_every_name():
     assert len(text.splitlines()) < 80
     words = set(re.findall(r"\w+", lbt.__doc__))
     assert [name for name in FACE if name not in words and name != "LbtSynthError"] == []
-
-
-def test_a_name_that_is_nowhere_is_refused():
-    refused(lambda: lbt.no_such_name, AttributeError, "no_such_name")
-    assert not hasattr(lbt, "__wrapped__")
 
 
 @pytest.mark.parametrize("path", [path for path in ROOMS if path != "errors"])
@@ -102,10 +99,7 @@ def test_examples_on_pages_run(page, monkeypatch):
 
 @pytest.mark.parametrize("page", _PAGES)
 def test_no_figure_is_left_to_be_filled_in(page):
-    """``{{NAME}}``, and a line that is one word in capitals, stand for what is still to be measured.
-
-    LaTeX and JSON close braces, too.
-    """
+    """``{{NAME}}`` and a line that is one word in capitals are; LaTeX and JSON close braces, too."""
     text = (ROOT / page).read_text(encoding="utf-8")
     assert re.findall(r".*(?:\{\{|\b[A-Z][A-Z0-9_]*\}\}).*", text) == []
     assert re.findall(r"^[A-Z]{4,}$", text, re.MULTILINE) == []

@@ -10,7 +10,7 @@ from support.commands import run_done
 from lbt_synth.cli.arguments import COMMANDS, build_parser
 
 
-def test_the_help_lists_every_command_once_in_groups(capsys):
+def test_the_help_lists_every_command_once_in_groups_and_says_the_defaults(capsys):
     text = run_done(capsys, "--help")
     groups = [line for line in text.splitlines() if line[:1].isalpha() and ": " in line]
     assert [group.partition(":")[0] for group in groups[1:-1]] == [
@@ -19,9 +19,6 @@ def test_the_help_lists_every_command_once_in_groups(capsys):
     ]
     names = [line.split()[0] for line in text.splitlines() if line[:2] == "  " and line[2] != " "]
     assert [name for name in names if name in COMMANDS] == list(COMMANDS)
-
-
-def test_help_says_the_defaults(capsys):
     for command, words in (
         ("tradeoff", "the Kalman filter's (default 9)"),
         ("identify", "counts as turbulence [Hz] (default 3)"),

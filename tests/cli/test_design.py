@@ -48,18 +48,12 @@ def test_the_time_of_a_fragile_delay_needs_no_margin_on_the_other_side(monkeypat
 
 def test_show_and_verify(capsys, gains):
     for name in ("integrator", "kalman"):
-        text, data = (
-            show(capsys, "show", gains[name], *more)
-            for show, more in ((run_done, ("--verbose",)), (run_json, ()))
-        )
-        design, moving = lbt.load_gain(gains[name]), data["moving_gain"]
-        cost = frame_cost(design)
+        words, design = ("show", gains[name]), lbt.load_gain(gains[name])
+        text, data = run_done(capsys, *words, "--verbose"), run_json(capsys, *words)
+        cost, moving = frame_cost(design), data["moving_gain"]
         assert re.search(rf"multiplications per frame +{cost.multiplications}\b", text)
-        for words in (
-            "proved while it moves at any speed, from",
-            "proved in the plain form, up to",
-        ):
-            assert words in text
+        assert "proved while it moves at any speed, from" in text
+        assert "proved in the plain form, up to" in text
         assert data["frame_cost"]["additions"] == cost.additions
         assert data["margins"]["modulus"] > 0
         assert moving["constant_low"] < moving["moving_low"] < 1

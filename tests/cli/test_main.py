@@ -12,6 +12,7 @@ import pytest
 from support.commands import run
 from support.configs import minimal_config, write_config
 from support.drifting import drift_file
+from support.night import simulated_night
 from support.plants import LBT_YAML
 from support.predictors import made
 from support.refusals import refused
@@ -40,7 +41,7 @@ def test_an_error_is_a_status_and_a_line(capsys, monkeypatch, more):
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory, gains, recorded_night, recorded_loop, sensors_config, sensors_file):
+def places(tmp_path_factory, gains, recorded_night, sensors_config, sensors_file):
     folder = tmp_path_factory.mktemp("places")
     lbt_text, rows = LBT_YAML.read_text(), "1.0,2.0,0.5,0.25\n2.0,1.0,0.25,0.5\n" * 100
     noise = re.sub(r"(?s)  pyramid:.*?(?=mirror:)", "  noise_nm: [12.0, 9.0]\n\n", lbt_text)
@@ -54,7 +55,7 @@ def places(tmp_path_factory, gains, recorded_night, recorded_loop, sensors_confi
     for name, content in texts.items():
         (folder / name).write_text(content)
     (folder / "DAMAGED.fits").write_bytes(gains["kalman"].read_bytes()[:4000])
-    run, _, ran = recorded_loop
+    run, _, ran = simulated_night()
     y, u = run.measurements[0, :3000], run.commands[0, :3000]
     np.savez(folder / "SHORT.npz", measurements=y, commands=u)
     lbt.save_gain(folder / "STALE.fits", replace(ran, configuration='{"version": 3}'))
@@ -147,7 +148,7 @@ WRONG = {
     "end-to-end CONFIG KALMAN -o out --pixels 11": "--pixels must be even, at least subapertures_",
     "end-to-end CONFIG --tables II -o out --seeds 0": "--seeds must be at least 1",
     "end-to-end CONFIG --tables II -o out --seed -1": "--seed must be at least 0",
-    "end-to-end CONFIG --tables II -o out nowhere.fits": "unrecognized arguments",
+    "end-to-end CONFIG none.fits --tables II -o out": "cannot read none.fits: No such file",
 }
 
 

@@ -172,10 +172,7 @@ SCREEN = {  # words and what a command says of its point, in the unit of the con
 
 
 def test_a_command_fits_on_a_screen(tmp_path, capsys, monkeypatch, sensors_config, sensors_file):
-    """Every command on the examples, in their order, says its point first: a sentence.
-
-    With ``units`` in the configuration, none shows a wavefront of tip and tilt in another one.
-    """
+    """Every command says its point first, a sentence, with wavefronts in ``units`` of the file."""
     monkeypatch.chdir(tmp_path)
     for path in (*(ROOT / "examples").glob("*.yaml"), sensors_config.source, sensors_file):
         text = path.read_bytes()

@@ -1,9 +1,7 @@
 """The commands paper and end-to-end: tables of the paper, and loops with a pyramid."""
 
-import contextlib
 import csv
 import importlib.metadata
-import io
 import re
 from dataclasses import replace
 from functools import partial
@@ -18,25 +16,16 @@ from support.small_telescope import needs_specula, small_config
 
 import lbt_synth as lbt
 from lbt_synth.cli import paper
-from lbt_synth.cli.main import main
 from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.interop.specula.simulation import mix_controller
 from lbt_synth.report.figures.studies import robustness_figure
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """The folder of the paper, what the command says in mas, and its figure of robustness."""
-    drawn, said, folder = [], io.StringIO(), tmp_path_factory.mktemp("paper")
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
-        draw = lambda *rows: drawn.append(robustness_figure(*rows)) or drawn[-1]  # noqa: E731
-        patch.setattr(paper.figures, "robustness_figure", draw)
-        assert main(["paper", "-o", str(folder), "--unit", "mas", "--verbose"]) == 0
-    return folder, said.getvalue(), drawn[0]
-
-
-def test_written_files(written):
-    folder, text, _ = written
+def test_the_paper_is_written_and_its_points_lie_on_our_curves(tmp_path, capsys, monkeypatch):
+    drawn, folder = [], tmp_path / "paper"
+    draw = lambda *rows: drawn.append(robustness_figure(*rows)) or drawn[-1]  # noqa: E731
+    monkeypatch.setattr(paper.figures, "robustness_figure", draw)
+    text = run_done(capsys, "paper", "-o", folder, "--unit", "mas", "--verbose")
     assert "Table III: Strehl ratio" in text
     assert re.search(r"turbulence pole, rms +0\.98860, 59\.38 mas ", text)
     assert re.search(r"80 mas as the rms of a sinusoid +80\.00 mas ", text)
@@ -48,10 +37,7 @@ def test_written_files(written):
     rows = list(csv.DictReader((folder / "table_iii.csv").read_text().splitlines()))
     assert (len(rows), float(rows[0]["paper_strehl_percent"])) == (30, 22.4)
     assert lbt.load_gain(folder / "paper_hinf.fits").recertify().passed
-
-
-def test_the_papers_points_lie_on_our_curves(written):
-    lines = {line.get_label(): line.get_xydata() for line in written[2].axes[0].get_lines()}
+    lines = {line.get_label(): line.get_xydata() for line in drawn[0].axes[0].get_lines()}
     assert len(lines) == 4
     for name in ("Kalman", "H∞"):
         ours, theirs = lines[name], sorted(map(tuple, lines[f"{name}, paper"]))
@@ -60,11 +46,6 @@ def test_the_papers_points_lie_on_our_curves(written):
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=800)
-
-
-@pytest.fixture(scope="module")
-def setup():
-    return load_setup()
 
 
 def integrator_file(folder, hardware=PATH):
@@ -89,7 +70,8 @@ def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path,
     assert refused(call, MissingExtraError, None).extra == "e2e"
 
 
-def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
+def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path):
+    setup = load_setup()
     bands = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 150}
     shell = lbt.models.PositionLoop.from_bandwidth(**bands)
     slow = replace(setup.hardware, mirror=shell)
@@ -102,9 +84,9 @@ def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
     assert "with the mirror taps c" in seen.convention
 
 
-def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys, setup):
+def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys):
     """A pyramid out of its range returns the same slopes whatever the tilt."""
-    loop_run = make_run(replace(setup, modes=3), frames=100)
+    loop_run = make_run(replace(load_setup(), modes=3), frames=100)
     lost = replace(loop_run, residual_nm=1e9 * (1 + loop_run.residual_nm))
     monkeypatch.setattr(paper, "specula_version", lambda: "1.1")
     monkeypatch.setattr(paper, "calibrate", lambda *_, **__: None)

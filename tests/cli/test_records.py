@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.commands import refuse_commands, run, run_done, run_json
 from support.diagnoses import given_design, line_record
-from support.night import GAIN, LINE_HZ, NOISE
+from support.night import GAIN, LINE_HZ, NOISE, simulated_night
 from support.recorded_loops import RATE, spliced_record
 
 import lbt_synth as lbt
@@ -21,8 +21,8 @@ def save_series(path, y, u):
 
 
 @pytest.fixture(scope="module")
-def tip_night(recorded_loop, tmp_path_factory):
-    run = recorded_loop[0]
+def tip_night(tmp_path_factory):
+    run = simulated_night()[0]
     path = tmp_path_factory.mktemp("tip") / "tip.npz"
     return save_series(path, run.measurements[0, :, :1], run.commands[0, :, :1])
 
@@ -60,11 +60,9 @@ def test_a_spectrum(tmp_path, capsys):
     assert np.diag(config.plant.R) == pytest.approx(49)
 
 
-def test_accelerometers_are_compared_with_the_lines_of_the_model(
-    tmp_path, capsys, recorded_loop, tip_night
-):
+def test_accelerometers_are_compared_with_the_lines_of_the_model(tmp_path, capsys, tip_night):
     """Two readings a frame in mm/s^2: a channel that follows the line twofold, and a dead one."""
-    total_nm = recorded_loop[0].total_nm[0][:, 0]
+    total_nm = simulated_night()[0].total_nm[0][:, 0]
     shake = np.diff(total_nm, n=2, prepend=[0, 0])  # mm/s^2 at 1 kHz
     noise = 0.05 * np.std(shake) * np.random.default_rng(4).standard_normal(shake.size)
     table = np.column_stack([2 * shake + noise, np.zeros(shake.size)]).repeat(2, axis=0)
@@ -85,8 +83,8 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     refuse_commands(capsys, [(" ".join(map(str, (*words, 500))), slow)])
 
 
-def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
-    run = recorded_loop[0]
+def test_faults_are_in_the_report(tmp_path, capsys):
+    run = simulated_night()[0]
     y = run.measurements[0].copy()
     y[5000:5400] = y[8000] = np.nan
     file = save_series(tmp_path / "a\x01.npz", y, run.commands[0])
@@ -106,7 +104,7 @@ def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys, monkeypatch):
     assert 0 < len(evaluations) < 10_000  # the search ends
 
 
-def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night, recorded_loop):
+def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night):
     out = tmp_path / "tt.fits"
     data = run_json(capsys, "auto", recorded_night, "-o", out)
     rows = {row["name"]: row for row in data["held_out"]}
@@ -117,7 +115,7 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night, 
     assert kalman < min(0.5 * left["what ran"], 1.02 * left["least-squares predictor"])
     assert kalman == pytest.approx(rows["Kalman filter"]["model_nm"], rel=0.1)
     # what ran is what the simulation left in its second half
-    half = np.split(recorded_loop[0].residual_nm[0], 2)[1]
+    half = np.split(simulated_night()[0].residual_nm[0], 2)[1]
     true = np.sqrt(np.sum(np.mean(half**2, axis=0)))
     tip, tilt = data["axes"]
     assert left["what ran"] == pytest.approx(true * GAIN / tip["sensor_gain"], rel=0.05)
@@ -132,8 +130,8 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night, 
     assert out.with_suffix(".png").is_file()
 
 
-def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
-    total_nm = recorded_loop[0].total_nm[0][:, 0]
+def test_an_open_loop_series_and_one_axis(tmp_path, capsys):
+    total_nm = simulated_night()[0].total_nm[0][:, 0]
     noise = np.random.default_rng(0).standard_normal(len(total_nm))
     np.save(tmp_path / "open.npy", total_nm + NOISE * noise)
     words = ("--columns", "open_loop=0", "--no-figure", "-o", tmp_path / "t.fits", *FACTS)
@@ -187,8 +185,8 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
     assert "note: the rest is of the axis that lives: the other one is dead" in text
 
 
-def test_auto_says_what_accelerometers_buy(tmp_path, capsys, recorded_loop, tip_night):
-    shake = 1e-3 * np.diff(recorded_loop[0].total_nm[0][:, 0], n=2, prepend=[0, 0])
+def test_auto_says_what_accelerometers_buy(tmp_path, capsys, tip_night):
+    shake = 1e-3 * np.diff(simulated_night()[0].total_nm[0][:, 0], n=2, prepend=[0, 0])
     np.save(tmp_path / "a.npy", shake)
     words = ("auto", tip_night, *FACTS, "--accelerometers", tmp_path / "a.npy", "--no-figure")
     words += ("--method", "predictor", "-o", tmp_path / "p.fits")

@@ -37,13 +37,9 @@ def alive(pid):
 
 def stopped(path, folder, number):
     """Stop a study with a signal when it has written two parts; return status and streams."""
-    first = subprocess.Popen(
-        [sys.executable, "-m", "lbt_synth", "study", path, "-o", folder, "--jobs", "2"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=hear_interruptions,
-    )
+    command = [sys.executable, "-m", "lbt_synth", "study", path, "-o", folder, "--jobs", "2"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    first = subprocess.Popen(command, preexec_fn=hear_interruptions, **pipes)
     wait_for(lambda: len(part_rows(folder)) >= 2)
     workers = Path(f"/proc/{first.pid}/task/{first.pid}/children").read_text().split()
     first.send_signal(number)
@@ -57,24 +53,24 @@ def test_the_command(tmp_path, capsys):
     folder = tmp_path / "out"
     words = ("study", path, "-o", folder)
     out = run_done(capsys, *words, "--verbose")
-    for text in ("50th percentile", "unstable", "failed", "Worst samples of b", "sensor_gain"):
+    words_of_tables = ("50th percentile", "unstable", "failed", "Worst samples of b", "sensor_gain")
+    for text in (*words_of_tables, "40 of 40 samples computed in"):
         assert text in out
-    assert "40 of 40 samples computed in" in out
     study, page = lbt.studies.load_study(path), folder / "summary.html"
     assert_whole(folder, study, evaluate_samples)
     assert b"<svg" in page.read_bytes()
     page.write_text("changed")
     data = run_json(capsys, *words)
-    assert (data["computed"], data["failures"]) == (0, 0)
+    assert (data["computed"], data["failures"], page.read_text()) == (0, 0, "changed")
     table = read_table(folder / "results.csv")
-    for name, controller in zip("ab", data["statistics"]["controllers"], strict=True):
-        assert controller["mean"] == pytest.approx(np.nanmean(table[f"{name}.strehl"]), rel=1e-7)
-    assert page.read_text() == "changed"
+    means = [controller["mean"] for controller in data["statistics"]["controllers"]]
+    expected = [np.nanmean(table[f"{name}.strehl"]) for name in "ab"]
+    assert means == pytest.approx(expected, rel=1e-7)
     page.unlink()
     out = run_done(capsys, *words, "--verbose")
-    assert "is finished: 40 samples in results.csv; none computed" in out
-    assert f"written: {page}" in out
-    assert f"unchanged: {folder / 'results.csv'}" in out
+    finished = "is finished: 40 samples in results.csv; none computed"
+    for text in (finished, f"written: {page}", f"unchanged: {folder / 'results.csv'}"):
+        assert text in out
     assert b"computing time, of all processes together" in page.read_bytes()
     again = run_json(capsys, *words, "--row", "7")
     assert again["fresh"]["a.strehl"] == pytest.approx(again["stored"]["a.strehl"], rel=1e-6)

@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 from support.commands import refuse_commands, run_done, run_json
+from support.night import simulated_night
 from support.plants import LBT_YAML
 from support.telemetry import full, same
 
@@ -63,10 +64,9 @@ def test_conversion_between_formats_keeps_the_control_loop_that_was_taken(tmp_pa
 
 @pytest.mark.e2e
 def test_conversion_to_the_standard_says_what_is_lost(tmp_path, capsys, night):
-    out = tmp_path / "copy.aot.fits"
+    out, seen = tmp_path / "copy.aot.fits", full()
     text = run_done(capsys, "telemetry", night, "-o", out)
     assert "the AOT standard has no place for residual_nm, total_nm" in text
-    seen = lbt.files.load_telemetry(night)
     assert same(seen, lbt.files.load_telemetry(out), but=lost_fields(seen), rtol=1e-14)
     assert run_json(capsys, "telemetry", out, "-o", tmp_path / "b.aot.fits")["lost"] == []
 
@@ -78,9 +78,9 @@ READING = (
 )
 
 
-def test_a_record_is_read_once(tmp_path, capsys, recorded_loop):
+def test_a_record_is_read_once(tmp_path, capsys):
     """What was said of a file is in the telemetry of it: no command needs to be told again."""
-    loop = recorded_loop[0]
+    loop = simulated_night()[0]
     y, u = loop.measurements[0, :6000] / lbt.models.nm_per_mas(8.22), -loop.commands[0, :6000] / 2
     y[1000:1002], y[2000, 1] = np.nan, 1e4
     table, night = tmp_path / "night.csv", tmp_path / "night.fits"

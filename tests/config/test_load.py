@@ -33,7 +33,6 @@ UNSTABLE = {"kind": "ar", "coefficients": [1.2], "driving_rms_nm": 1.0}
 
 
 def line_in(section, **keys):
-    """Return a section of a configuration with one vibration of 20 Hz."""
     kind = {"damping": 0.01} if section == "model" else {"kind": "sinusoid"}
     return {section: {"vibrations": [{"frequency_hz": 20.0, **kind, **keys}]}}
 

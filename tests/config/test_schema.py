@@ -8,16 +8,13 @@ UNITS |= {"_hz": "[Hz]", "_nm": "[nm"}
 COUNTS = {"settle_frames"}  # of frames, not in frames
 
 
-def test_every_key_has_a_description_with_its_unit():
+def test_editors_know_every_key_with_its_unit_and_what_is_required():
     for section in (SCHEMA, *SCHEMA["$defs"].values()):
         for key, value in section.get("properties", {}).items():
             assert value["description"]
             for ending, unit in UNITS.items():
                 if key.endswith(ending) and key not in COUNTS and "sensor_gain" not in key:
                     assert unit in value["description"], key
-
-
-def test_editors_know_every_key_and_what_is_required():
     for section in (SCHEMA, SCHEMA["$defs"]["LoopSection"]):
         assert section["additionalProperties"] is False
     assert SCHEMA["$schema"].endswith("2020-12/schema")

@@ -2,6 +2,7 @@
 
 from collections import namedtuple
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -15,18 +16,16 @@ from lbt_synth.errors import GainFileError, OutputError, TelemetryError
 from lbt_synth.storage.array_file import npz_bytes
 
 
-def is_same_design(one, other):
-    return np.array_equal(one.controller.A, other.controller.A) and np.array_equal(
-        one.gain_predictor, other.gain_predictor
-    )
+def same_filter(one, other):
+    arrays = attrgetter("controller.A"), attrgetter("gain_predictor")
+    return all(np.array_equal(get(one), get(other)) for get in arrays)
 
 
 Kind = namedtuple("Kind", "make save load error is_same")
+make = partial(original, "bare")
 save, load = lbt.files.save_telemetry, lbt.files.load_telemetry
 KINDS = {
-    "gain": Kind(
-        partial(original, "bare"), lbt.save_gain, lbt.load_gain, GainFileError, is_same_design
-    ),
+    "gain": Kind(make, lbt.save_gain, lbt.load_gain, GainFileError, same_filter),
     "telemetry": Kind(full, save, load, TelemetryError, same),
 }
 

@@ -9,14 +9,7 @@ from astropy.io import fits
 from support.record_files import image
 from support.refusals import refused
 
-from lbt_synth.storage.array_file import (
-    fits_bytes,
-    npz_bytes,
-    open_fits,
-    read_fits,
-    read_npz,
-    read_numpy,
-)
+from lbt_synth.storage.array_file import fits_bytes, npz_bytes, open_fits, read_fits, read_npz
 
 
 def table_file(*, sums):
@@ -60,9 +53,9 @@ FRAGMENTS = b"", b"\x93NUMPY", b"PK\x03\x04", b"SIMPLE"
     ("call", "content", "words"),
     [
         (read_npz, npz_bytes({"A": np.array([1.0, 5j])}, "{}"), "A holds no real numbers"),
-        (read_numpy, patched(24, struct.pack("<I", 2**31)), "unpacks to more than 1024 MB"),
-        (read_numpy, patched(6, b"\xff\xff"), "broken"),  # the version needed to extract
-        (read_numpy, patched(8, b"\xff\xff"), "broken"),  # flags
+        (read_npz, patched(24, struct.pack("<I", 2**31)), "unpacks to more than 1024 MB"),
+        (read_npz, patched(6, b"\xff\xff"), "broken"),  # the version needed to extract
+        (read_npz, patched(8, b"\xff\xff"), "broken"),  # flags
         *((read, content, None) for read in (read_npz, read_fits) for content in FRAGMENTS),
         (fits_names, b"", "FITS"),
         *((fits_names, content[:3000], "FITS") for content in TABLES),

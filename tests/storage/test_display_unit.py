@@ -3,13 +3,7 @@
 import pytest
 from support.refusals import refused
 
-from lbt_synth.storage.display_unit import (
-    nm_text,
-    own_display_unit,
-    show_in,
-    shown_format,
-    shown_unit,
-)
+from lbt_synth.storage import display_unit
 from lbt_synth.storage.rows import column, fact_table, json_record, nm_column, row_table, table_row
 
 
@@ -34,27 +28,30 @@ SHOWN = {
 
 def test_only_nanometres_change_until_the_command_ends_even_if_it_fails():
     plain = {unit: (unit, 1.0) for unit in SHOWN}
-    assert {unit: shown_unit(unit) for unit in SHOWN} == plain
+    assert {unit: display_unit.shown_unit(unit) for unit in SHOWN} == plain
 
     def fail():
-        with own_display_unit():
-            show_in("mas", 10.0)
-            assert {unit: shown_unit(unit) for unit in SHOWN} == SHOWN
+        with display_unit.own_display_unit():
+            display_unit.show_in("mas", 10.0)
+            assert {unit: display_unit.shown_unit(unit) for unit in SHOWN} == SHOWN
             raise ValueError("stop")
 
     refused(fail, ValueError, "stop")
-    assert {unit: shown_unit(unit) for unit in SHOWN} == plain
-    assert nm_text(5.0) == "5 nm"
+    assert {unit: display_unit.shown_unit(unit) for unit in SHOWN} == plain
+    assert display_unit.nm_text(5.0) == "5 nm"
 
 
 def test_tables_change_with_their_digits_and_records_do_not():
-    assert [shown_format(".1f", factor) for factor in (0.1, 1 / 2055)] == [".2f", ".4f"]
-    assert shown_format(".3g", 0.1) == ".3g"
+    assert [display_unit.shown_format(".1f", factor) for factor in (0.1, 1 / 2055)] == [
+        ".2f",
+        ".4f",
+    ]
+    assert display_unit.shown_format(".3g", 0.1) == ".3g"
     assert row_table("t", [ROW]).headings[1] == "residual [nm]"
-    with own_display_unit():
-        show_in("mas", 10.0)
-        assert nm_text(27.46, ".1f", unit="nm rms") == "2.75 mas rms"
-        assert nm_text(27.46, error_nm=1.2) == "2.75 +- 0.12 mas"
+    with display_unit.own_display_unit():
+        display_unit.show_in("mas", 10.0)
+        assert display_unit.nm_text(27.46, ".1f", unit="nm rms") == "2.75 mas rms"
+        assert display_unit.nm_text(27.46, error_nm=1.2) == "2.75 +- 0.12 mas"
         table = row_table("t", [ROW])
         assert table.headings == ("design", "residual [mas]", "line [Hz]")
         assert table.rows == (("a", "2.75", "20"),)

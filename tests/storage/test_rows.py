@@ -41,6 +41,8 @@ def test_a_table_has_headings_with_units_and_formatted_cells():
         ("b", "hinf", "+1.00", "-", "unstable", "9", "no"),
     )
     assert table.words == (1,)
+    values = math.nan, np.float64(-0.0), math.inf, 1234567.0, np.bool_(True), 12345678
+    assert [*map(rows.cell_text, values)] == ["-", "0", "inf", "1.23457e+06", "yes", "12345678"]
     assert (
         rows.row_table("Loops", ROWS, without=["limit_nm", "stable"]).headings[-1]
         == "residual [nm]"
@@ -90,8 +92,3 @@ def test_a_row_takes_what_is_not_given_from_its_sources():
     assert expected.items() | {("stable", False)} <= dataclasses.asdict(row).items()
     with pytest.raises(TypeError, match="missing"):
         rows.fill_row(Loop, Margins(), name="c")
-
-
-def test_cells():
-    values = math.nan, np.float64(-0.0), math.inf, 1234567.0, np.bool_(True), 12345678
-    assert [*map(rows.cell_text, values)] == ["-", "0", "inf", "1.23457e+06", "yes", "12345678"]

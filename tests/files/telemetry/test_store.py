@@ -14,6 +14,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, OutputError, ProblemError, TelemetryError
 from lbt_synth.files import load_telemetry, save_telemetry, telemetry_from_simulation
 from lbt_synth.files.telemetry import store
+from lbt_synth.files.telemetry.aot import lost_fields
 from lbt_synth.files.telemetry.telemetry import LAYERS
 from lbt_synth.storage import array_file as archive
 
@@ -76,6 +77,7 @@ def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, mirror, name
     assert np.allclose(np.diff(u, axis=0), 0.1 * (seen.measurements[1:] @ inverse.T), atol=1e-9)
     assert (seen.metadata["seed"], seen.delay_frames) == (5, delay)
     # the loop of the file is the loop that ran
+    assert "mirror" not in lost_fields(seen)
     for field in ("sensor", "influence", "mirror_taps"):
         assert np.array_equal(getattr(seen.hardware, field), getattr(path, field))
     again = lbt.simulate(design, truth, hardware=seen.hardware, **size)
@@ -162,11 +164,7 @@ def test_what_is_no_simulation_is_refused():
         (telemetry(path=other), ProblemError, "must be that of the simulation, at 800 Hz"),
         (telemetry(3), ProblemError, "expected a Simulation; got int"),
         (telemetry(path=3), ProblemError, "expected a LoopHardware; got int"),
-        (
-            telemetry(path=two),
-            DimensionError,
-            "interaction_matrix must have 1 measurement to match",
-        ),
+        (telemetry(path=two), DimensionError, "interaction_matrix must have 1 measurement to"),
         (lambda: save_telemetry("t.fits", 3), OutputError, "got int"),
     ]
     require_refusals(rows)

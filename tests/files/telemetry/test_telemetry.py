@@ -45,10 +45,7 @@ from lbt_synth.errors import ProblemError
         ({"metadata": {"a": [1]}}, "metadata must hold texts, numbers and truth values; got list"),
         ({"metadata": {"a": float("inf")}}, "metadata must be finite; got inf for 'a'"),
         ({"delay_frames": None, "mirror": None}, "does not tell the delay"),
-        (
-            {"commands": np.ones((6, 3)), "influence_matrix": None},
-            "3 commands of 2 modes, and no influence_matrix",
-        ),
+        ({"commands": np.ones((6, 3)), "influence_matrix": None}, "3 commands of 2 modes, and no"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes, text):
