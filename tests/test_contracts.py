@@ -16,7 +16,7 @@ FORBIDDEN = {
     "interop/new_program.py": ("specula", "Only interop.specula.optics imports specula"),
     "files/telemetry/new_format.py": ("aotpy", "Only files.telemetry.aot imports aotpy"),
     "files/telemetry/new_archive.py": ("h5py", "Only storage.array_file imports h5py"),
-    "studies/study/new_pool.py": ("distributed", "Only studies.grid imports distributed"),
+    "studies/study/new_pool.py": ("distributed", "Only storage.executors imports distributed"),
     "report/page/new_chart.py": ("bokeh", "Only report.explore imports bokeh"),
     "report/page/new_sheet.py": ("weasyprint", "Only report.page.html imports weasyprint"),
     "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),

@@ -14,26 +14,26 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3172,
+    "cli": 3175,
     "config": 1622,
     "design": 5984,
     "files": 1252,
-    "identification": 8857,
+    "identification": 8860,
     "interop": 3687,
     "linear": 4749,
-    "loop": 3945,
+    "loop": 3953,
     "methods": 784,
     "models": 3749,
-    "report": 3264,
-    "storage": 1060,
-    "studies": 3271,
+    "report": 3269,
+    "storage": 1126,
+    "studies": 3200,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 28267,
+    "lines of tests": 27411,
     "lines of benchmarks": 3998,
     "words of docs": 62512,
 }

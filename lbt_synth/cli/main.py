@@ -24,7 +24,7 @@ from lbt_synth.cli.arguments import COMMANDS, build_parser, command_options
 from lbt_synth.cli.streams import discard, print_error, show_progress
 from lbt_synth.errors import ConfigError, LbtSynthError, SynthesisError
 from lbt_synth.storage.display_unit import own_display_unit
-from lbt_synth.storage.thread_limits import limit_threads
+from lbt_synth.storage.executors import limit_threads
 
 DONE, FAILED, WRONG = 0, 1, 2
 INTERRUPTED, BROKEN_PIPE, TERMINATED = 130, 141, 143  # as shells count signals

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,11 +18,12 @@ from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.report.pages import study_verdict
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
+from lbt_synth.storage.executors import choose_engine
 from lbt_synth.storage.words import duration_text
-from lbt_synth.studies.grid import choose_engine
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
 from lbt_synth.studies.study.statistics import study_statistics, summary_tables, worst_table
 from lbt_synth.studies.study.study import Study
+from lbt_synth.validation import integer
 
 _FAILURE = ("row", "controller", "error")
 _WORST = 3  # rows of each controller that are printed; the page has more
@@ -119,6 +121,7 @@ def run_in_parts(
 
     An interruption says where what is finished stays.
     """
+    integer(arguments.jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
     with (
         choose_engine(arguments.jobs, getattr(arguments, "dask", None)) as (executor, workers),
         count_progress(total=total, what=what) as count,

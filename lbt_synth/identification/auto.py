@@ -48,7 +48,8 @@ from lbt_synth.identification.records.record import (
     require_length,
     split_halves,
 )
-from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, stable_sensor_gains
+from lbt_synth.loop.budget import model_covariances
 from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import design_request
 from lbt_synth.models import TipTiltPlant
@@ -304,8 +305,8 @@ def note_drift(record: LoopRecord, plant: TipTiltPlant, loop: ClosedLoop) -> Ite
     """
     if loop.reads_others:
         return
-    budget = residual_budget(loop, plant, frame_means=True)
-    residual_nm = np.sqrt(np.diag(budget.total_nm2))
+    covariance = model_covariances(loop, plant).mean(axis=0)
+    residual_nm = np.sqrt(np.diag(covariance)[: record.axes])
     series = record.pseudo_open_loop(np.diag(loop.hardware.sensor))[record.usable]
     seconds = np.flatnonzero(record.usable) / record.frame_rate_hz
     speed, mean = np.polyfit(seconds - np.mean(seconds), series, 1)

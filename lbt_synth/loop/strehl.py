@@ -15,6 +15,7 @@ from itertools import product
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike
 from scipy.special import ive, j0, j1
 
@@ -33,7 +34,8 @@ from lbt_synth.validation import (
 
 _DIRECTIONS = 64  # of nodes in half a turn, for jitter of at most _TURNS
 _TURNS = 5.0  # of phase over the pupil; beyond them the nodes are made denser
-_FEW_TURNS = 1.0  # of phase over the pupil; below them half of the directions is as good
+_FEW_TURNS = np.array([1.5, 0.7, 0.25])  # below each, half of the directions is as good: 1e-9
+_FEW_RADII = {-1: 24, -2: 20, -3: 10}  # that are as good where the directions are fewer
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
 
@@ -150,7 +152,7 @@ def _integrated_otf(
 ) -> FloatArray:
     """Return Strehl ratios (p,) of jitters of a spread (p,), in turns of phase over the pupil."""
     fineness = np.ceil(np.log2(np.maximum(spread / _TURNS, 1.0))).astype(np.int64)
-    fineness[spread < _FEW_TURNS] = -1
+    fineness -= np.sum(spread[:, None] < _FEW_TURNS, axis=1)
     # |f.a|^2 and f'Sf are quadratic forms of f
     forms = _quadratic_form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
     widths = _quadratic_form(covariance)
@@ -235,7 +237,13 @@ def _radial_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArr
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    return radius, weight / weight.sum()
+    weight /= weight.sum()
+    if count := _FEW_RADII.get(fineness):  # G. H. Golub, J. H. Welsch, Math. Comp. 23, 221 (1969)
+        root, square = np.sqrt(weight), radius**2
+        basis, _ = np.linalg.qr(root[:, None] * chebvander(2 * square - 1, count - 1))
+        square, vectors = np.linalg.eigh(basis.T @ (square[:, None] * basis))
+        radius, weight = np.sqrt(square), (root @ basis @ vectors) ** 2
+    return radius, weight
 
 
 @lru_cache(maxsize=32)

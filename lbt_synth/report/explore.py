@@ -31,18 +31,17 @@ from bokeh.plotting import figure as new_figure
 from bokeh.server.server import Server
 
 from lbt_synth.config import Config
-from lbt_synth.config.load import build_config, validate_sections
-from lbt_synth.config.schema import FileSection
+from lbt_synth.config.load import build_config
+from lbt_synth.config.samples import with_values
+from lbt_synth.config.schema import FileSection, TrueVibrationSection
 from lbt_synth.config.write import config_text
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.linear.norms import spectral_norms
-from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins, stable_sensor_gains
 from lbt_synth.methods.registry import METHODS, default_method, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
-from lbt_synth.models import Vibration
-from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs import frequency_errors, require_compatible
 from lbt_synth.report.draw import GREY, colour, dashes
 from lbt_synth.report.figures.loops import frequency_grid
@@ -57,7 +56,6 @@ from lbt_synth.studies import robustness_map
 from lbt_synth.studies.limits import compare_in_truth, say_residual
 from lbt_synth.validation import FloatArray
 
-Content: TypeAlias = dict[str, Any]  # of a configuration file
 Curve: TypeAlias = tuple[FloatArray, FloatArray]  # abscissae and ordinates, in units that are shown
 Designs: TypeAlias = Mapping[str, Design]
 SHIFT = "shift"  # key of the knob that moves the true lines
@@ -73,7 +71,7 @@ class Knob:
     low: float
     high: float
     value: float  # where it stands before it is moved
-    edit: Callable[[Config, Content, float], None]  # puts a value into a configuration
+    edit: Callable[[FileSection, float], FileSection]  # puts a value into settings
 
 
 def list_knobs(config: Config) -> Iterator[Knob]:
@@ -84,13 +82,14 @@ def list_knobs(config: Config) -> Iterator[Knob]:
     yield Knob("delay", "total delay", "frames", 1.0, max(6.0, delay), delay, edit)
     edit = partial(_scale, "truth", "sensor_gain", gain)
     yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, edit)
-    if (noise_nm := _noise_nm(config)) > 0:
-        ends = noise_nm / 5, 5 * noise_nm
-        yield Knob("noise", "measurement noise", "nm", *ends, noise_nm, _set_noise)
+    noise_nm = float(np.sqrt(np.mean(np.square(config.noise_nm))))
+    if noise_nm > 0:
+        edit = partial(_scale_noise, config.noise_nm, noise_nm)
+        yield Knob("noise", "measurement noise", "nm", noise_nm / 5, 5 * noise_nm, noise_nm, edit)
     low, high = frequency_errors(config)[[0, -1]].tolist()
     if low < high:
-        label = "frequency error, true less assumed"
-        yield Knob(SHIFT, label, "Hz", low, high, 0.0, _set_shift)
+        label, edit = "frequency error, true less assumed", partial(_shift, config)
+        yield Knob(SHIFT, label, "Hz", low, high, 0.0, edit)
     for key, label, unit, name in (
         ("seeing", "seeing", "arcsec", "seeing_arcsec"),
         ("wind", "wind speed", "m/s", "wind_speed_m_s"),
@@ -101,7 +100,7 @@ def list_knobs(config: Config) -> Iterator[Knob]:
             yield Knob(key, label, unit, value / 4, 4 * value, value, edit)
     if lines := settings.model.vibrations:
         damping = float(np.exp(np.mean(np.log([line.damping for line in lines]))))
-        ends, edit = (damping / 5, min(5 * damping, 0.9)), partial(_scale_damping, damping)
+        ends, edit = (damping / 5, min(5 * damping, 0.9)), partial(_scale_damping, config, damping)
         yield Knob("damping", "assumed damping", "", *ends, damping, edit)
     ratio = float(settings.design.gamma_ratio)
     methods = ", ".join(name for name, m in METHODS.items() if "gamma_ratio" in m.configurable)
@@ -109,66 +108,69 @@ def list_knobs(config: Config) -> Iterator[Knob]:
     yield Knob("gamma_ratio", f"gamma ratio of {methods}", "", 1.0, 3.0, ratio, edit)
 
 
-def _noise_nm(config: Config) -> float:
-    return float(np.sqrt(np.mean(np.square(config.noise_nm))))
-
-
 def _scale(
-    section: str, name: str, start: float, config: Config, content: Content, value: float
-) -> None:
+    section: str, name: str, start: float, settings: FileSection, value: float
+) -> FileSection:
     """Scale a number of a section from its start."""
-    usual = getattr(getattr(config.settings, section), name)
+    scaled = getattr(getattr(settings, section), name) * value / start
     # the value of the slider, and not a neighbour by rounding
-    content.setdefault(section, {})[name] = float(f"{usual * value / start:.12g}")
+    return with_values(settings, {(section, name): float(f"{scaled:.12g}")})
 
 
-def _set_noise(config: Config, content: Content, value: float) -> None:
+def _scale_noise(
+    noises_nm: float | FloatArray, start: float, settings: FileSection, value: float
+) -> FileSection:
     """Scale the noise of all measurements."""
-    sensor = content["sensor"]
-    for name in ("noise_mas", "pyramid"):
-        sensor.pop(name, None)
-    sensor["noise_nm"] = (value / _noise_nm(config) * np.asarray(config.noise_nm)).tolist()
+    scaled = (value / start * np.asarray(noises_nm)).tolist()
+    sizes = {"noise_nm": scaled, "noise_mas": None, "pyramid": None}
+    return with_values(settings, {("sensor", name): size for name, size in sizes.items()})
 
 
-def _set_shift(config: Config, content: Content, value: float) -> None:
+def _shift(config: Config, settings: FileSection, value: float) -> FileSection:
     """Move the true lines, the one that moves most by a shift; those of the model stay."""
-    for line in _true_lines(config, content):
-        line["frequency_hz"] += config.truth.frequency_shift_hz(line["frequency_hz"], value)
+    lines = []
+    for line in _true_lines(config, settings):
+        moved_hz = line.frequency_hz + config.truth.frequency_shift_hz(line.frequency_hz, value)
+        lines.append(line.model_copy(update={"frequency_hz": moved_hz}))
+    return with_values(settings, {("truth", "vibrations"): lines})
 
 
-def _scale_damping(start: float, config: Config, content: Content, value: float) -> None:
+def _scale_damping(
+    config: Config, start: float, settings: FileSection, value: float
+) -> FileSection:
     """Scale the damping of the lines of the model; those of the truth stay."""
-    _true_lines(config, content)
-    for line in content["model"]["vibrations"]:
-        if line["damping"] < 0.99:  # from there on it is a drift
-            line["damping"] = min(line["damping"] * value / start, 0.99)
+    edits: dict[Any, Any] = {("truth", "vibrations"): _true_lines(config, settings)}
+    for i, line in enumerate(settings.model.vibrations or ()):
+        if line.damping < 0.99:  # from there on it is a drift
+            scaled = min(line.damping * value / start, 0.99)
+            edits["model", "vibrations", i, "damping"] = scaled
+    return with_values(settings, edits)
 
 
-def _true_lines(config: Config, content: Content) -> list[Content]:
+def _true_lines(config: Config, settings: FileSection) -> list[TrueVibrationSection]:
     """Return the lines of the truth; those that it takes from the model become its own."""
-    truth = content.setdefault("truth", {})
-    if not isinstance(truth.get("vibrations", []), list):
-        lines = stationary_vibrations(config.truth.vibrations)
-        errors = config.truth.frequency_errors_hz or (None,) * len(lines)
-        entries = truth["vibrations"] = []
-        for line, error in zip(lines, errors, strict=True):
-            if not isinstance(line, Vibration):
-                continue
-            names = ("frequency_hz", "damping", "rms_nm")
-            entry = {"kind": "resonance", **{n: float(getattr(line, n)) for n in names}}
-            if len(line.direction) == 2:
-                entry["direction_deg"] = float(np.degrees(np.arctan2(*line.direction[::-1])))
-            entries.append(entry if error is None else {**entry, "frequency_error_hz": error})
-    return truth.setdefault("vibrations", [])  # type: ignore[no-any-return]  # of a file
+    if isinstance(settings.truth.vibrations, list):
+        return settings.truth.vibrations
+    sections, lines = [], config.plant.vibrations
+    errors = config.truth.frequency_errors_hz or (None,) * len(lines)
+    for line, error_hz in zip(lines, errors, strict=True):
+        names = ("frequency_hz", "damping", "rms_nm", "sections")
+        content = {"kind": "resonance"} | {name: getattr(line, name) for name in names}
+        if len(line.direction) == 2:
+            content["direction_deg"] = float(np.degrees(np.arctan2(*line.direction[::-1])))
+        if error_hz is not None:
+            content["frequency_error_hz"] = error_hz
+        sections.append(TrueVibrationSection(**content))
+    return sections
 
 
 def move(config: Config, values: Mapping[str, float]) -> Config:
     """Return the configuration with knobs at other values; ConfigError where they do not fit."""
-    content = config.settings.model_dump(exclude_unset=True)
+    settings = config.settings
     for knob in list_knobs(config):
         if knob.key in values:
-            knob.edit(config, content, min(max(values[knob.key], knob.low), knob.high))
-    return build_config(validate_sections(FileSection, content, config.source), config.source)
+            settings = knob.edit(settings, min(max(values[knob.key], knob.low), knob.high))
+    return build_config(settings, config.source)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -300,12 +302,16 @@ def judge(view: View) -> str:
     compared = compare_in_truth({view.name: view.design}, config)
     row, *others = compared.rows
     checks = f"Certified: {count_text(len(view.design.certificate.checks), 'check')} passed."
-    if not row.stable:
-        return f"{view.name} is UNSTABLE in this loop. {checks}"
     gain = config.truth.sensor_gain
-    loop = close_loop(config.hardware, view.design.controller, sensor_gain=gain)
-    margins = loop_margins(loop)
-    sentences = [*(f"WARNING: {text}" for text in margins.fragilities)]
+    if not row.stable:
+        ends = stable_sensor_gains(config.hardware, view.design.controller)
+        low, high, real = (f"{config.sensor_gain * factor:.2f}" for factor in (*ends, gain))
+        return (
+            f"{view.name} is stable at sensor gains of {low} to {high}; at {real} this loop is "
+            f"UNSTABLE. {checks}"
+        )
+    margins = loop_margins(close_loop(config.hardware, view.design.controller, sensor_gain=gain))
+    sentences = [f"WARNING: {fragility}" for fragility in margins.fragilities]
     sentences.append(say_residual(view.name, row, compared.limit))
     best = min(others, key=lambda other: other.residual_nm, default=row)
     if best.residual_nm < row.residual_nm:
@@ -526,25 +532,24 @@ def serve(
     for name, design in designs.items():
         require_compatible(name, design, start.hardware)
     first, saved = new_view(start, designs), list[Path]()
-    place = port
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        for family, *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-            with socket.create_server((address[0], place), family=family) as probe:
-                place = probe.getsockname()[1]
+        with socket.create_server((host, port), family=family) as probe:
+            place = probe.getsockname()[1]
+        hosts = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
+        server = Server(
+            {"/": lambda document: Session(document, start, designs, first, folder, saved)},
+            address=host,
+            port=place,
+            allow_websocket_origin=[*hosts, *origins],
+        )
     except (OSError, UnicodeError) as error:  # a name of another alphabet, or too long
         reason = getattr(error, "strerror", None) or str(error)
         raise ProblemError(
             f"cannot serve at --host {host} --port {port}: {reason}. Try another one; --port 0 is "
             "any that is free."
         ) from error
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    hosts = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
-    server = Server(
-        {"/": lambda document: Session(document, start, designs, first, folder, saved)},
-        address=host,
-        port=place,
-        allow_websocket_origin=[*hosts, *origins],
-    )
     server.start()
     try:
         announce(f"http://{name}:{place}/")

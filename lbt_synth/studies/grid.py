@@ -3,8 +3,7 @@
 What a loop leaves has the same columns for one loop and for a stack of them. Answers that fit on a
 page are kept in memory (:func:`evaluate`). A part of a :class:`Sweep` holds the results of a fixed
 number of consecutive rows in a file that is named by them, and a sweep that was killed at any
-moment goes on with the rows that no part has. The work is done in line, by processes of this
-machine, or by a Dask cluster; nothing else imports Dask.
+moment goes on with the rows that no part has.
 """
 
 from __future__ import annotations
@@ -23,17 +22,12 @@ from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 
-import lbt_synth
-from lbt_synth.errors import (
-    LbtSynthError,
-    MissingExtraError,
-    NumericalError,
-    OutputError,
-    ProblemError,
-)
+from lbt_synth.errors import LbtSynthError, NumericalError, OutputError
 from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, strehl
-from lbt_synth.loop.budget import ResidualBudget
-from lbt_synth.models import Truth
+from lbt_synth.loop.budget import ResidualBudget, ensemble_residuals
+from lbt_synth.loop.ensemble import LoopEnsemble
+from lbt_synth.loop.evaluator import Matrices
+from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import (
     UNFINISHED,
@@ -42,8 +36,7 @@ from lbt_synth.storage.atomic_files import (
     write_atomically,
 )
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
-from lbt_synth.validation import FloatArray, integer
+from lbt_synth.validation import FloatArray
 
 Answer = TypeVar("Answer")
 Rows = tuple[int, int]  # the first, and the one after the last
@@ -53,7 +46,6 @@ RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what
     name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
 }
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
-_TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 _DELETE = "Delete it, and it is computed again."
 
 
@@ -93,6 +85,13 @@ def evaluate(
     finally:
         for future in running:
             future.cancel()
+
+
+def ensemble_columns(
+    matrices: Matrices, hardware: LoopHardware, ensemble: LoopEnsemble, imaging: Imaging
+) -> dict[str, Any]:
+    """Return what controllers A, B, C, D leave in many loops, by column (p,)."""
+    return residual_columns(ensemble_residuals(matrices, hardware, ensemble), imaging)
 
 
 class Part(NamedTuple):
@@ -262,61 +261,3 @@ def _explain_failure(rows: Rows) -> Iterator[None]:
             "of memory, or has another lbt_synth than this one. What is written is kept: start "
             "the study again, perhaps with fewer jobs, and it goes on from there."
         ) from error
-
-
-@contextlib.contextmanager
-def choose_engine(
-    jobs: int, dask: str | None = None
-) -> Iterator[tuple[futures.Executor | None, int | None]]:
-    """Provide the executor of a Dask scheduler or of processes with its workers; None for one.
-
-    The processes have one thread each, and end at once if the block fails.
-    """
-    if dask is not None:
-        with connect_cluster(dask) as cluster:
-            yield cluster
-    elif jobs == 1:
-        yield None, None
-    else:
-        integer(jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
-        with limit_threads(), WorkerPool(jobs) as pool:
-            yield pool, jobs
-
-
-@contextlib.contextmanager
-def connect_cluster(address: str) -> Iterator[tuple[futures.Executor, int]]:
-    """Provide the executor of a Dask scheduler with this package, and how many threads it has.
-
-    A scheduler can run code on its clients: name only one that you trust. Dask's own configuration
-    names the files of an encrypted connection.
-    """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise MissingExtraError(
-            '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
-        ) from error
-    try:
-        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        text = " ".join(str(error).split()) or "no answer"
-        raise ProblemError(
-            f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
-            "such as tcp://host:8786; start one with dask scheduler, and dask worker."
-        ) from error
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=_TIMEOUT_S)
-        except TimeoutError as error:
-            raise ProblemError(
-                f"the scheduler at {address} has no workers; start some with dask worker {address}."
-            ) from error
-        hosts = client.get_versions(packages=["lbt_synth"])["workers"]
-        versions = {host["packages"].get("lbt_synth") or "none" for host in hosts.values()}
-        if versions != {lbt_synth.__version__}:
-            raise ProblemError(
-                f"all workers must have lbt_synth {lbt_synth.__version__}, as here; those of "
-                f"{address} have {', '.join(sorted(versions))}. Start them from the same "
-                "environment."
-            )
-        yield client.get_executor(pure=False), sum(client.ncores().values())

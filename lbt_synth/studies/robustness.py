@@ -19,7 +19,6 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, loop_margins
-from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
 from lbt_synth.loop.evaluator import textbook_matrices
@@ -38,7 +37,7 @@ from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.models.turbulence.ar_models import radial_orders
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
-from lbt_synth.studies.grid import evaluate, loop_columns, residual_columns
+from lbt_synth.studies.grid import ensemble_columns, evaluate, loop_columns
 from lbt_synth.studies.limits import LimitStudy, limits
 from lbt_synth.validation import (
     BoolArray,
@@ -283,12 +282,27 @@ def robustness_map(
     moved_hz = np.array([[line.frequency_hz for line in lines] for lines in moved])  # (e, lines)
     require_matching_controller(hardware.own_sensor_alone(), as_controller(design))
     size = delays.size, gains.size, errors.size
+    matrices = textbook_matrices([as_controller(design)])
     samples = (
-        (design, hardware, truth, imaging, moved_hz, delay, some)
+        (
+            matrices,
+            hardware,
+            LoopEnsemble(
+                sensor_gain=np.repeat(some, errors.size),
+                delay_frames=hardware.delay_frames + delay,
+                noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
+                turbulence=truth.turbulence,
+                vibrations=tuple(
+                    replace(ensemble_vibration(line), frequency_hz=np.tile(line_hz, some.size))
+                    for line, line_hz in zip(truth.vibrations, moved_hz.T, strict=True)
+                ),
+            ),
+            imaging,
+        )
         for delay in delays
         for some in np.array_split(gains, -(-gains.size // _GAINS_AT_ONCE))
     )
-    stacks = list(evaluate(_map_columns, samples, executor))
+    stacks = list(evaluate(ensemble_columns, samples, executor))
     strehl, residual_nm, stable = (
         read_only(np.concatenate([stack[name] for stack in stacks]).reshape(size))
         for name in ("strehl", "residual_nm", "stable")
@@ -301,30 +315,6 @@ def robustness_map(
         residual_nm=residual_nm,
         stable=read_only(stable[..., 0] == 1),
     )
-
-
-def _map_columns(
-    design: Design,
-    hardware: LoopHardware,
-    truth: Truth,
-    imaging: Imaging,
-    moved_hz: FloatArray,
-    delay_error_frames: float,
-    gains: FloatArray,
-) -> dict[str, FloatArray]:
-    """Return the columns of loops of all gains, with the lines at e frequencies (e, lines)."""
-    ensemble = LoopEnsemble(
-        sensor_gain=np.repeat(gains, len(moved_hz)),
-        delay_frames=hardware.delay_frames + delay_error_frames,
-        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
-        turbulence=truth.turbulence,
-        vibrations=tuple(
-            replace(ensemble_vibration(line), frequency_hz=np.tile(line_hz, gains.size))
-            for line, line_hz in zip(truth.vibrations, moved_hz.T, strict=True)
-        ),
-    )
-    matrices = textbook_matrices([as_controller(design)])
-    return residual_columns(ensemble_residuals(matrices, hardware, ensemble), imaging)
 
 
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:

@@ -126,7 +126,7 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
 def test_no_scheduler_and_one_without_workers(tmp_path, capsys, monkeypatch):
     from distributed import LocalCluster
 
-    monkeypatch.setattr("lbt_synth.studies.grid._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.storage.executors._TIMEOUT_S", 1)
     before = time.monotonic()
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""):
         refuse_dask(capsys, tmp_path, address, "no Dask scheduler answers at")

@@ -1,29 +1,17 @@
 """A design from a record: the method that it asks for, the gains that it allows, and notes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 import pytest
-from support.control_laws import ordinary_loop
 from support.night import GAIN, night_record
 from support.recorded_loops import LINE, RATE, drifting_record, resonant_record, spliced_record
 from support.refusals import refused, require_refusals
-from support.wrong_commands import record
 
 import lbt_synth as lbt
 from lbt_synth.errors import CertificateError, ProblemError
-from lbt_synth.identification import IdentifiedModel, LoopRecord, loop_record
-from lbt_synth.identification.auto import (
-    allowed_gains,
-    choose_method,
-    design_for_gains,
-    note_drift,
-    quick_methods,
-    unstable_gains,
-)
+from lbt_synth.identification import IdentifiedModel, LoopRecord, auto, loop_record
 from lbt_synth.identification.prediction.regression import noisier
 from lbt_synth.identification.prediction.residual import estimate_residual
 from lbt_synth.methods import registry
@@ -31,8 +19,7 @@ from lbt_synth.methods.registry import default_method, method_named
 
 LOOP = {"frame_rate_hz": RATE, "delay_frames": 2, "unit": "nm"}
 SERIES = ("measurements", "commands")
-TITLES = {name: method_named(name).title for name in ("kalman", "hinf", "lqg")}
-USUAL = TITLES["kalman"]
+USUAL, OTHER = (method_named(name).title for name in ("kalman", "hinf"))
 
 
 @cache
@@ -43,11 +30,8 @@ def strong_loop(line=LINE) -> tuple[LoopRecord, IdentifiedModel]:
 
 
 def test_a_design_is_doubted_where_the_gains_disagree() -> None:
-    first, other = (
-        strong_loop()[0],
-        spliced_record((1,), lines=LINE, frames=12_000, sensor_gain=0.4),
-    )
-    pairs = ((getattr(first, name)[:12_000], getattr(other, name)) for name in SERIES)
+    other = spliced_record((1,), lines=LINE, frames=12_000, sensor_gain=0.4)
+    pairs = ((getattr(strong_loop()[0], name)[:12_000], getattr(other, name)) for name in SERIES)
     made = lbt.design_from_record(loop_record(*map(np.vstack, pairs), **LOOP), method="hinf")
     assert made.name == "H-infinity filter"
     assert any("sensor gain" in note for note in made.notes)
@@ -55,17 +39,16 @@ def test_a_design_is_doubted_where_the_gains_disagree() -> None:
 
 def test_a_design_needs_a_delay_and_data():
     noise = np.random.default_rng(0).standard_normal((9000, 1))
-    late = loop_record(noise, noise, frame_rate_hz=RATE, unit="nm")
-    short = loop_record(noise[:900], **LOOP)
-    delay = "delay of this loop is not known; give delay_frames"
-    frames = r"needs 4000 usable frames \(4 s at 1000 Hz\).*got 900 \(0.9"
+    short, late = loop_record(noise[:900], **LOOP), loop_record(noise, noise, **LOOP)
+    rows = [
+        (replace(late, delay_frames=None), {}, "delay .*; give delay_frames"),
+        (noise, {}, "LoopRecord"),
+        (short, {}, r"needs 4000 usable frames \(4 s at 1000 Hz\).*got 900 \(0.9"),
+        (short, {"method": "magic"}, "method"),
+    ]
     require_refusals(
-        [
-            (lambda: lbt.design_from_record(late), ProblemError, delay),
-            (lambda: lbt.design_from_record(noise), ProblemError, "LoopRecord"),
-            (lambda: lbt.design_from_record(short), ProblemError, frames),
-            (lambda: lbt.design_from_record(short, method="magic"), ProblemError, "method"),
-        ]
+        (partial(lbt.design_from_record, record, **options), ProblemError, words)
+        for record, options, words in rows
     )
 
 
@@ -73,148 +56,127 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
     rate = 500.0
     air = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=rate)
     plant = lbt.tip_tilt_plant(frame_rate_hz=rate, turbulence=air, noise_nm=5.0, sensor_gain=0.5)
-    controller = lbt.kalman(plant).controller
-    loop = lbt.close_loop(plant.hardware, controller)
+    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
     residual = abs(loop.sensitivity([1e-6])[0, 1, 1])
     assert 0.01 < residual < 0.5
-
-    def notes(offset_nm: float, speed_nm_s: float) -> list[str]:
-        """Return the notes on noise whose commands move on the second axis."""
-        noise, commands = np.random.default_rng(0).standard_normal((5000, 2)), np.zeros((5000, 2))
+    noise, commands = np.random.default_rng(0).standard_normal((5000, 2)), np.zeros((5000, 2))
+    notes = []
+    for offset_nm, speed_nm_s in ((10.0, 1.0), (3000.0, -200.0)):
         commands[:, 1] = offset_nm + speed_nm_s * (np.arange(5000) - 2500) / rate
-        made = loop_record(noise, commands, **LOOP | {"frame_rate_hz": rate})
-        return list(note_drift(made, plant, loop))
-
-    assert notes(10.0, 1.0) == []
-    (note,) = notes(3000.0, -200.0)
+        record = loop_record(noise, commands, **LOOP | {"frame_rate_hz": rate})
+        notes.append([*auto.note_drift(record, plant, loop)])
+    quiet, (note,) = notes
+    assert quiet == []
     assert note.startswith("axis 1 of the record stands 3e+03 nm off zero and drifts by -200 nm/s.")
     said = float(note.split("leaves up to ")[1].split(" nm")[0])
     assert said == pytest.approx(residual * (3000 + 5 * 200), rel=0.05)
 
 
-def residuals(*, error, **differences):
-    """Return residuals of methods, whose variances are below 1000 by differences on three parts."""
-    parts = {USUAL: [], **{TITLES[name]: [] for name in differences}}
-    for i in range(3):
-        common, own = np.random.default_rng(i).standard_normal((2, 6000))
-        common *= np.sqrt(1000 / np.mean(common**2))
-        own -= common * (common @ own) / (common @ common)
-        # its product with the common part scatters
-        size = 6000 * error**2 / 4000
-        own *= np.sqrt(size / np.mean(own**2))
-        parts[USUAL].append(common)
-        for name, less in differences.items():
-            parts[TITLES[name]].append(np.sqrt(1 - (less[i] + size) / 1000) * common + own)
+def residuals(differences, error):
+    """Return residuals of two methods, the other's below 1000 by differences on three parts."""
+    series = [], []
+    for i, less in enumerate(differences):
+        white = np.random.default_rng(i).standard_normal((6000, 2))
+        common, own = np.sqrt(6000) * np.linalg.qr(white)[0].T
+        scatter = 6000 * error**2 / 4000  # of its product with the common part
+        series[0].append(np.sqrt(1000) * common)
+        series[1].append(np.sqrt(1000 - less - scatter) * common + np.sqrt(scatter) * own)
     zero = np.zeros((1, 1))
-    return {
-        name: estimate_residual(np.concatenate(series)[:, None], ((5, 18_005),), zero, zero)
-        for name, series in parts.items()
-    }
+    return [
+        estimate_residual(np.concatenate(parts)[:, None], ((5, 18_005),), zero, zero)
+        for parts in series
+    ]
 
 
 @pytest.mark.parametrize(
     ("differences", "error", "chosen"),
     [
-        ((40.0, 40.0, 40.0), 4.0, "hinf"),
-        ((400.0, 400.0, 10.0), 1.0, "kalman"),  # less than 2 % of the variance on one part
-        ((400.0, 400.0, -20.0), 1.0, "kalman"),  # more on one
-        ((25.0, 25.0, 25.0), 20.0, "kalman"),  # within two errors
-        ((-20.0, -20.0, -20.0), 1.0, "kalman"),
+        ((40.0, 40.0, 40.0), 4.0, OTHER),
+        ((400.0, 400.0, 10.0), 1.0, USUAL),  # less than 2 % of the variance on one part
+        ((400.0, 400.0, -20.0), 1.0, USUAL),  # more on one
+        ((25.0, 25.0, 25.0), 20.0, USUAL),  # within two errors
+        ((-20.0, -20.0, -20.0), 1.0, USUAL),
     ],
 )
 def test_the_default_stays_unless_another_wins_every_part(differences, error, chosen):
-    compared = residuals(error=error, hinf=differences)
-    pairs = zip(compared[USUAL].parts(3), compared[TITLES["hinf"]].parts(3), strict=True)
-    for (usual, other), difference in zip(pairs, differences, strict=True):
-        above, its_error = usual.above(other)
-        assert above == pytest.approx(difference)
-        assert its_error == pytest.approx(error, rel=0.3) or difference >= 400
-    title, note = choose_method(compared)
-    assert title == TITLES[chosen]
-    words = "H-infinity filter is chosen" if chosen == "hinf" else "Kalman filter stays"
-    assert f"the {words}" in note
-    if chosen == "hinf":
-        _, error = compared[USUAL].above(compared[TITLES["hinf"]])
+    usual, other = residuals(differences, error)
+    for row in zip(usual.parts(3), other.parts(3), differences, strict=True):
+        above, its_error = row[0].above(row[1])
+        assert above == pytest.approx(row[2])
+        assert its_error == pytest.approx(error, rel=0.3) or row[2] >= 400
+    title, note = auto.choose_method({USUAL: usual, OTHER: other})
+    assert title == chosen
+    assert ("the Kalman filter stays" in note) == (chosen == USUAL)
+    if chosen == OTHER:
+        _, error = usual.above(other)
+        assert "the H-infinity filter is chosen" in note
         assert note.endswith(f"less than the Kalman filter, in all by 40 +- {error:.2g} nm^2")
-    del compared[USUAL]  # without the default the best is chosen
-    assert choose_method(compared)[0] == TITLES["hinf"]
+    # without the default the best is chosen
+    assert auto.choose_method({OTHER: other})[0] == OTHER
 
 
 def test_all_quick_methods_are_in_the_table_of_unseen_data(monkeypatch):
     made = lbt.design_from_record(night_record(), sensor_gain=GAIN, most_lines=1)
     names = [row.name for row in made.held_out.entries]
-    assert {method_named(name).title for name in quick_methods()} < set(names)
+    assert {method_named(name).title for name in auto.quick_methods()} < set(names)
     assert (made.name, made.design.method) == ("Kalman filter", "kalman")
     (note,) = made.notes
     assert note.startswith("the Kalman filter stays")
-    assert default_method() in quick_methods()
-    usual = method_named(default_method())
+    assert default_method() in auto.quick_methods()
     for slow in (False, True):
-        newcomer = replace(usual, name="newcomer", slow=slow)
+        newcomer = replace(method_named(default_method()), name="newcomer", slow=slow)
         monkeypatch.setitem(registry.METHODS, "newcomer", newcomer)
-        assert ("newcomer" in quick_methods()) is not slow
-
-
-def with_gain(model: IdentifiedModel, gain: float, error: float) -> IdentifiedModel:
-    """Return a model with another gain and error."""
-    axes = (replace(a, sensor_gain=gain, sensor_gain_error=error) for a in model.axes)
-    return replace(model, axes=tuple(axes))
-
-
-def test_a_drift_over_frozen_flow_does_not_carry_the_gain_away() -> None:
-    """It did, to 0.03: what the loop leaves is coloured noise over a line, at no gain at all."""
-    made = drifting_record(337)
-    model = lbt.identify(made)
-    ((low, high),) = allowed_gains(made, model)
-    assert low < 0.5859 < high
-    error = model.axes[0].sensor_gain_error
-    assert model.sensor_gains[0] == pytest.approx(0.5859, abs=3 * error)
+        assert ("newcomer" in auto.quick_methods()) is not slow
 
 
 @pytest.mark.parametrize(
     ("make", "gain", "widest"),
-    [(lambda: record(*ordinary_loop()), 0.7, 2), (resonant_record, 0.9, 1.6)],
+    [
+        (night_record, GAIN, 2),
+        (resonant_record, 0.9, 1.6),
+        # a drift over frozen flow: what the loop leaves is coloured noise over a line, at no gain
+        (lambda: drifting_record(337), 0.5859, 4),
+    ],
 )
 def test_the_true_gain_is_allowed(make, gain, widest) -> None:
-    y, u = (getattr(make(), name)[:, 0] for name in SERIES)
-    made = loop_record(y, u, **LOOP | {"frame_rate_hz": make().frame_rate_hz})
-    low, high = allowed_gains(made, lbt.identify(made)).T
-    assert np.all(low < gain)
-    assert np.all(high > gain)
-    assert np.all(high / low < widest)
+    seen = make()
+    known = LOOP | {"frame_rate_hz": seen.frame_rate_hz}
+    made = loop_record(seen.measurements[:, 0], seen.commands[:, 0], **known)
+    model = lbt.identify(made)
+    low, high = auto.allowed_gains(made, model).T
+    assert np.all((low < gain) & (gain < high) & (high < widest * low))
+    assert model.sensor_gains[0] == pytest.approx(gain, abs=3 * model.axes[0].sensor_gain_error)
 
 
 def test_the_interval_is_what_the_fit_the_sensor_and_the_law_allow() -> None:
     """The integrator of gain 0.4 was stable below a sensor gain of 2.5, and sensors have 0.2 to 1.25."""
     made, model = strong_loop()
-
-    def gains(model: IdentifiedModel) -> list[float]:
-        return allowed_gains(made, model)[0].tolist()
-
-    spread = np.exp(3 * 0.4 / 1.3)
-    for gain, error, interval in (
-        (0.8, 0.08, (0.8 * np.exp(-0.3), 0.8 * np.exp(0.3))),
-        (0.8, 0.4, (0.2, 1.25)),
-        (1.3, 0.4, (1.3 / spread, 2.5)),
-    ):
-        assert gains(with_gain(model, gain, error)) == pytest.approx(interval)
-    (axis,) = model.axes
+    (axis,), spread = model.axes, np.exp(3 * 0.4 / 1.3)
+    cases = [
+        (replace(axis, sensor_gain=gain, sensor_gain_error=error), interval)
+        for gain, error, interval in (
+            (0.8, 0.08, (0.8 * np.exp(-0.3), 0.8 * np.exp(0.3))),
+            (0.8, 0.4, (0.2, 1.25)),
+            (1.3, 0.4, (1.3 / spread, 2.5)),
+        )
+    ]
     odd = replace(axis, whiteness=replace(axis.whiteness, p_value=1e-9))
     spread = 1.5 * np.exp(3 * odd.sensor_gain_error / odd.sensor_gain)
-    expected = (odd.sensor_gain / spread, 1.25)
-    assert gains(replace(model, axes=(odd,))) == pytest.approx(expected)
+    for changed, interval in [*cases, (odd, (odd.sensor_gain / spread, 1.25))]:
+        gains = auto.allowed_gains(made, replace(model, axes=(changed,)))
+        assert gains[0].tolist() == pytest.approx(interval)
 
 
 def test_gains_at_which_a_loop_is_unstable() -> None:
     """An integrator of gain g is stable below a sensor gain of 1 / g, and less where it is late."""
     design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=1000), gain=0.5)
-    assert unstable_gains(design, np.array([[0.1, 1.8], [0.2, 1.8]])) is None
-    assert unstable_gains(design, np.array([[0.1, 1.0], [0.2, 2.01]]))[1] == 2.01
+    assert auto.unstable_gains(design, np.array([[0.1, 1.8], [0.2, 1.8]])) is None
+    assert auto.unstable_gains(design, np.array([[0.1, 1.0], [0.2, 2.01]]))[1] == 2.01
     late = replace(design.hardware, delay_frames=2.1)
     _, high = lbt.loop.stable_sensor_gains(late, design.controller)
     assert 1.9 < high < 2
     for gain, stable in ((0.999 * high, True), (1.001 * high, False)):
-        assert (unstable_gains(design, np.array([[gain, gain]] * 2)) is None) is stable
+        assert (auto.unstable_gains(design, np.array([[gain, gain]] * 2)) is None) is stable
 
 
 def noisy(model: IdentifiedModel, synthesis=lbt.kalman, **options):
@@ -222,14 +184,16 @@ def noisy(model: IdentifiedModel, synthesis=lbt.kalman, **options):
     return lambda factor: synthesis(noisier(model, factor).plant(), **options)
 
 
-def careless(model: IdentifiedModel):
-    """Return the same for a filter whose controller alone is unstable."""
-    return noisy(model, lbt.hinf, gamma_ratio=1.02, route="riccati")
+# a filter whose controller alone is unstable
+careless = partial(noisy, synthesis=lbt.hinf, gamma_ratio=1.02, route="riccati")
 
 
-def narrow_line() -> IdentifiedModel:
-    """Return the model of a loop of sensor gain 0.9 under a strong narrow line."""
-    return strong_loop(((60.0, 0.004, 100.0),))[1]
+NARROW = ((60.0, 0.004, 100.0),)  # frequency [Hz], damping, rms [nm]
+
+
+def design_for(model, allowed, *, known=True, make=noisy):
+    """Return the design, what it multiplies the noise by, and a note."""
+    return auto.design_for_gains(model, make(model), allowed, command_scale_known=known)
 
 
 def beyond_its_margin(model: IdentifiedModel, factor: float = 1.1) -> np.ndarray:
@@ -240,72 +204,69 @@ def beyond_its_margin(model: IdentifiedModel, factor: float = 1.1) -> np.ndarray
 
 
 def test_gains_that_the_fit_shows_keep_the_design() -> None:
-    model, allowed = strong_loop()[1], np.array([[0.6, 1.2]])
-    design, noise, note = design_for_gains(model, noisy(model), allowed, command_scale_known=True)
+    model = strong_loop()[1]
+    design, noise, note = design_for(model, np.array([[0.6, 1.2]]))
     assert design.method == "kalman"
     (text,) = design.assumptions
     assert "the loop is stable at all of these" in text
     assert "at the size that was applied, as was stated" in text
     assert (noise, note) == (1.0, "")
-    free, *_ = design_for_gains(model, noisy(model), None, command_scale_known=False)
+    free, *_ = design_for(model, None, known=False)
     assert free.assumptions == ()
 
 
 def test_more_noise_is_assumed_where_the_fitted_design_is_unstable() -> None:
     """At the price that the note says: the least noise that is stable, to a tenth."""
-    model = narrow_line()
+    _, model = strong_loop(NARROW)
     allowed = beyond_its_margin(model)
     factors = list[float]()
 
-    def design(factor: float) -> lbt.Design:
-        factors.append(factor)
-        return noisy(model)(factor)
+    def recorded(model: IdentifiedModel):
+        return lambda factor: factors.append(factor) or noisy(model)(factor)
 
-    safe, noise, note = design_for_gains(model, design, allowed, command_scale_known=True)
-    assert unstable_gains(safe, allowed) is None
+    safe, noise, note = design_for(model, allowed, make=recorded)
+    assert auto.unstable_gains(safe, allowed) is None
     assert f"to be stable at sensor gains of {allowed[0, 0]:.3g} to" in note
     assert f"the design assumes {noise:.3g} times the noise" in note
-    loops = [lbt.close_loop(model.hardware, each.controller) for each in (design(1.0), safe)]
+    loops = [lbt.close_loop(model.hardware, each.controller) for each in (noisy(model)(1.0), safe)]
     least, paid = (lbt.residual_budget(loop, model.truth()).rms_nm for loop in loops)
     assert least < paid < 1.1 * least
-    stable = {f for f in factors if unstable_gains(noisy(model)(f), allowed) is None}
-    below = max(set(factors) - stable)
-    assert min(stable) == noise < 1.15 * below
+    stable = {f for f in factors if auto.unstable_gains(noisy(model)(f), allowed) is None}
+    assert min(stable) == noise < 1.15 * max(set(factors) - stable)
     # a gain that the record leaves open is asked for
     wide = beyond_its_margin(model, 1.5) * [0.5, 1.0]
-    *_, note = design_for_gains(model, noisy(model), wide, command_scale_known=True)
+    *_, note = design_for(model, wide)
     assert note.startswith("warning: to be stable")
     assert "Give --sensor-gain, which the record leaves open" in note
 
 
 def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
-    model, allowed = narrow_line(), np.array([[0.85, 0.95]])
-    best, *_ = design_for_gains(model, careless(model), allowed, command_scale_known=True)
-    assert unstable_gains(best, allowed * [0.5, 1.0]) is not None
-    safe, _, note = design_for_gains(model, careless(model), allowed, command_scale_known=False)
-    assert unstable_gains(safe, allowed * [0.5, 1.0]) is None
+    (_, model), allowed = strong_loop(NARROW), np.array([[0.85, 0.95]])
+    best, *_ = design_for(model, allowed, make=careless)
+    safe, _, note = design_for(model, allowed, make=careless, known=False)
+    assert auto.unstable_gains(best, allowed * [0.5, 1.0]) is not None
+    assert auto.unstable_gains(safe, allowed * [0.5, 1.0]) is None
     assert "at half of them" in safe.assumptions[0]
     assert "--command-scale 1" in note
 
 
 def test_axes_of_different_gains_may_have_those_of_both() -> None:
     """Commands of one axis at twice their size gave a design that was unstable in the loop."""
-    y, u = ordinary_loop()
-    made = record(y, u * [1.0, 2.0])
+    night = night_record()
+    made = replace(night, commands=night.commands * [1.0, 2.0])
     model = lbt.identify(made)
     assert model.sensor_gains == pytest.approx((0.7, 0.35), rel=0.15)
     assert any("recorded at another size" in note for note in model.notes)
-    allowed = allowed_gains(made, model)
-    design, *_ = design_for_gains(model, noisy(model), allowed, command_scale_known=False)
+    design, *_ = design_for(model, auto.allowed_gains(made, model), known=False)
     assert "each axis at those of both, because they differ" in design.assumptions[0]
     both = np.outer([1, 1], [min(model.sensor_gains), max(model.sensor_gains)])
-    assert unstable_gains(design, both) is None
+    assert auto.unstable_gains(design, both) is None
 
 
 def test_gains_at_which_nothing_is_stable_are_refused() -> None:
     model, wide = strong_loop()[1], np.array([[0.02, 0.9]])
     stubborn = careless(model)(1.0)
     for known in (True, False):
-        make = partial(design_for_gains, model, lambda _: stubborn, wide, command_scale_known=known)
-        error = refused(make, CertificateError, r"the record allows 0.0\d to 0.9")
+        call = partial(design_for, model, wide, known=known, make=lambda _: lambda _: stubborn)
+        error = refused(call, CertificateError, r"the record allows 0.0\d to 0.9")
         assert ("Give --command-scale 1 if" in str(error)) is not known

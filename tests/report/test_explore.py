@@ -62,7 +62,9 @@ def test_the_verdict(start, first):
     certified = f"Certified: {len(first.design.certificate.checks)} checks passed."
     assert text.endswith(certified)
     unstable = judge(new_view(start, {}, "kalman", {"gain": 2.4}))
-    assert unstable == f"Kalman is UNSTABLE in this loop. {certified}"
+    ends = lbt.loop.stable_sensor_gains(start.hardware, first.design.controller)
+    words = "Kalman is stable at sensor gains of {:.2f} to {:.2f}; at 2.40 this loop is UNSTABLE."
+    assert unstable == f"{words.format(*ends)} {certified}"
     assert judge(new_view(start, {}, "hinf", {"gain": 0.6})).startswith("WARNING: 0.0")
 
 
@@ -162,12 +164,13 @@ def test_a_shift_moves_the_truth_alone(tmp_path, five):
     expected = frequencies(five.truth.with_frequency_error(2.5).vibrations)
     assert frequencies(after.truth.vibrations) == pytest.approx(expected)
     content = five_lines()
-    content["model"]["vibrations"][1]["frequency_error_hz"] = 2.0
+    content["model"]["vibrations"][1] |= {"frequency_error_hz": 2.0, "sections": 3}
     config = lbt.load_config(write_config(tmp_path, content))
     after = move(config, {"shift": 1.0})
     places = sorted(set(frequencies(after.truth.vibrations)))
     assert places == pytest.approx([13.0, 21.0, 33.0, 48.0, 72.5])
     assert after.truth.frequency_errors_hz == pytest.approx(config.truth.frequency_errors_hz)
+    assert [line.sections for line in after.truth.vibrations] == [1, 1, 3, 3] + 6 * [1]
     damped = move(five, {"damping": 0.02})  # what is assumed leaves the truth
     assert [line.damping for line in damped.plant.vibrations] == pytest.approx([0.02] * 10)
     assert [line.damping for line in damped.truth.vibrations] == [0.005] * 10

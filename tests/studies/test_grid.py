@@ -18,7 +18,7 @@ from support.studies import assert_whole, evaluate_quickly, load_small_study, ma
 import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
-from lbt_synth.storage.thread_limits import WorkerPool
+from lbt_synth.storage.executors import WorkerPool
 from lbt_synth.studies import run_study
 from lbt_synth.studies.grid import Sweep, evaluate
 from lbt_synth.studies.limits import limits

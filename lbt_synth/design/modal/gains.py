@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.polynomial import polyadd
 from numpy.typing import ArrayLike
-from scipy.signal import welch
 from scipy.special import comb
 
 from lbt_synth.design.integrator import PURE, TRIED_GAINS, integrator_gain_limit
@@ -222,6 +221,8 @@ def modal_gains_from_telemetry(
             f"measurements and commands must both be (frames, modes); got {y.shape} and {u.shape}."
         )
     y, u = y.T, u.T
+    from scipy.signal import welch  # slow to import
+
     count, frames = y.shape
     segment = integer(segment_frames, "segment_frames", at_least=16)
     gain = number_per_mode(sensor_gain, "sensor_gain", count, above=0)

@@ -26,7 +26,8 @@ from lbt_synth.identification.prediction.residual import (
 from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord, Stretches, split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
+from lbt_synth.loop import Imaging, close_loop, strehl
+from lbt_synth.loop.budget import model_covariances
 from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.methods.method import DesignInputs
 from lbt_synth.methods.registry import method_named
@@ -203,7 +204,8 @@ def prediction_against_data(
         estimate = estimate_residual(gather(residual, test), test, *noise)
         promised = None
         if name in stable and not stable[name].reads_others:  # in means over frames, as records are
-            promised = residual_budget(stable[name], plant, frame_means=True).total_nm2
+            covariances = model_covariances(stable[name], plant)  # at each phase
+            promised = covariances[:, : record.axes, : record.axes].mean(axis=0)
         rows.append(_build_row(name, estimate, promised, imaging))
     if refuted := [row.name for row in rows if row.replayed and row.replayed.refuted]:
         notes.append(

@@ -19,7 +19,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import rfft
-from scipy.signal import welch
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.faults import SURPRISING
@@ -120,6 +119,8 @@ class ResidualEstimate:
 
     def excess_band(self, other: ResidualEstimate) -> tuple[float, float]:
         """Return the band around the largest excess of power over another residual [1/frame]."""
+        from scipy.signal import welch  # slow to import
+
         powers = (welch(one.measured_nm, nperseg=_SEGMENT, axis=0)[1] for one in (self, other))
         more = np.subtract(*(np.sum(power, axis=1) for power in powers))
         peak, below = int(np.argmax(more)), np.flatnonzero(more < np.max(more) / 2)

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.signal import freqz, get_window, welch
-from scipy.stats import kstwobign
+from scipy.special import kolmogi
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -323,7 +322,7 @@ def _draw_innovations(axes: Axes, axis: IdentifiedAxis) -> None:
     """Draw the cumulative periodogram of the innovations less that of white noise."""
     test, f = axis.whiteness, axis.frequency_hz
     even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
-    bound = 100 * kstwobign.isf(0.01) / np.sqrt(test.effective)  # of Kolmogorov's statistic
+    bound = 100 * kolmogi(0.01) / np.sqrt(test.effective)  # of Kolmogorov's statistic
     excess = 100 * (test.cumulative - even)
     reach = max(2 * bound, 1.2 * float(np.max(np.abs(excess))))
     title = "innovations, less white noise"
@@ -341,6 +340,8 @@ def run_spectra(run: Simulation) -> tuple[FloatArray, FloatArray, FloatArray]:
 
     They are by Welch's method, means over the runs and sums over the axes [nm^2/Hz].
     """
+    from scipy.signal import welch  # slow to import
+
     how: dict[str, Any] = {"nperseg": _segment(run), "detrend": False, "axis": 1}
     f, opened = welch(run.total_nm, run.frame_rate_hz, **how)
     _, residual = welch(run.residual_nm, run.frame_rate_hz, **how)
@@ -361,6 +362,8 @@ def exact_spectrum(
     of it with a Hann window w of that length: ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the
     window's Fourier transform.
     """
+    from scipy.signal import freqz, get_window  # slow to import
+
     rate = loop.hardware.frame_rate_hz
     inside = np.clip(frequency_hz, frequency_hz[1] / 2, None)  # spectra may be infinite at 0
     total: FloatArray = random_density(loop, truth, inside, in_image=False).sum(axis=1)

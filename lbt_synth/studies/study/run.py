@@ -22,7 +22,6 @@ from lbt_synth.errors import CertificateError, LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.linear import solve_dare
 from lbt_synth.linear.matrix_functions import transpose
-from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.methods.request import DesignRequest
 from lbt_synth.models import TipTiltPlant
@@ -33,7 +32,7 @@ from lbt_synth.storage.atomic_files import (
     write_atomically,
 )
 from lbt_synth.storage.tables import csv_bytes
-from lbt_synth.studies.grid import Failure, Result, Sweep, loop_columns, refuse, residual_columns
+from lbt_synth.studies.grid import Failure, Result, Sweep, ensemble_columns, loop_columns, refuse
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
     NOISE_FACTOR,
@@ -143,8 +142,7 @@ def _evaluate_group(
             delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
             noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
         )
-        residuals = ensemble_residuals(matrices, hardware, loops)
-    return residual_columns(residuals, config.imaging)
+        return ensemble_columns(matrices, hardware, loops, config.imaging)
 
 
 def _kalman_matrices(plants: list[TipTiltPlant]) -> tuple[FloatArray, ...]:

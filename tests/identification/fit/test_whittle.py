@@ -1,20 +1,18 @@
-"""The likelihood: how the taper smears lines, gradient and information, of one axis and of two."""
-
-from __future__ import annotations
+"""Periodograms and their likelihood: parameters, smearing, gradient and information."""
 
 import dataclasses
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import simpson
-from scipy.optimize import approx_fprime
 from scipy.signal import fftconvolve
 from support.recorded_loops import RATE, integrator_loop, open_record
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit import whittle
 from lbt_synth.identification.fit.fitting import Search, fit
 from lbt_synth.identification.fit.periodogram import TAPER, LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import (
@@ -23,17 +21,6 @@ from lbt_synth.identification.fit.spectrum_model import (
     Background,
     Component,
     SpectrumModel,
-)
-from lbt_synth.identification.fit.whittle import (
-    SKIRT,
-    Priors,
-    contrast,
-    density,
-    derivatives,
-    log_smearing,
-    observe_information,
-    scoring_minimum,
-    spectral_matrix,
 )
 
 W = 2 * np.pi / RATE
@@ -56,20 +43,58 @@ def test_smearing_is_the_integral_that_defines_it(width: float, distance: float)
     kernel = r * np.exp(-2 * np.pi * width * t) * np.cos(2 * np.pi * distance * t)
     smeared = 2 * simpson(kernel, x=t)
     line = width / np.pi / (width**2 + distance**2)
-    log_ratio = log_smearing(width, np.array([distance]))[0][0]
+    log_ratio = whittle.log_smearing(width, np.array([distance]))[0][0]
     assert log_ratio == pytest.approx(np.log(smeared / line), abs=1e-4)
 
 
-@given(width=st.floats(1e-3, 25), distance=st.floats(0.02, SKIRT))
+@given(width=st.floats(1e-3, 25), distance=st.floats(0.02, whittle.SKIRT))
 @settings(max_examples=10, deadline=None)
 def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
     d, h = np.array([-distance, distance]), 1e-6
-    _, by_width, by_distance = log_smearing(width, d)
-    numeric = log_smearing(width * np.exp(h), d)[0] - log_smearing(width * np.exp(-h), d)[0]
-    assert by_width == pytest.approx(numeric / (2 * h), abs=1e-4)
-    numeric = log_smearing(width, d + h)[0] - log_smearing(width, d - h)[0]
+    _, by_width, by_distance = whittle.log_smearing(width, d)
+    wider, narrower = (whittle.log_smearing(width * np.exp(step), d)[0] for step in (h, -h))
+    assert by_width == pytest.approx((wider - narrower) / (2 * h), abs=1e-4)
+    numeric = whittle.log_smearing(width, d + h)[0] - whittle.log_smearing(width, d - h)[0]
     assert by_distance == pytest.approx(numeric / (2 * h), rel=1e-4, abs=1e-4)
     assert by_distance[0] == pytest.approx(-by_distance[1])
+
+
+def periodogram_of(series: np.ndarray) -> LoopPeriodogram:
+    return loop_periodogram(series, None, frame_rate_hz=RATE, stretches=[(0, series.size)])
+
+
+def test_periodogram_of_white_noise_is_its_density_and_leaks_nothing_of_turbulence() -> None:
+    rng = np.random.default_rng(1)
+    white = 3 * rng.standard_normal(20_000)
+    data, level = periodogram_of(white), 2 * 9 / RATE
+    assert np.mean(data.power(1.0)) == pytest.approx(level, rel=0.02)
+    # a random walk a thousand times larger at low frequencies leaves the noise as it is
+    leaking = periodogram_of(white + np.cumsum(rng.standard_normal(white.size)) * 2)
+    walk_density = 2 * 4 / RATE / (4 * np.sin(np.pi * data.frequency_hz / RATE) ** 2)
+    excess = leaking.power(1.0) / (level + walk_density)
+    assert np.mean(excess[data.frequency_hz > 300]) == pytest.approx(1, rel=0.04)
+
+
+def test_a_gap_shortens_the_segments_and_keeps_most_frames() -> None:
+    y = np.random.default_rng(0).standard_normal(30_000)
+    y[9990:10_010] = 1e6  # what a gap holds is never used
+    data = loop_periodogram(y, None, frame_rate_hz=RATE, stretches=[(0, 9990), (10_010, 30_000)])
+    assert np.mean(data.power(1.0)) == pytest.approx(2 / RATE, rel=0.03)
+    assert 0.8 * 15_000 < np.sum(data.count) < 15_000
+
+
+def test_what_lies_between_two_axes_at_any_gains() -> None:
+    rng = np.random.default_rng(3)
+    y, c = np.cumsum(rng.standard_normal((2, 3000, 2)), axis=1)
+    make = partial(loop_periodogram, frame_rate_hz=500.0, stretches=[(0, 1400), (1410, 3000)])
+    gains, data = np.array([0.7, 1.3]), make(y, c)
+    for i in range(2):
+        assert data.row(i).power(0.6) == pytest.approx(make(y[:, i], c[:, i]).power(0.6))
+    z, matrix = y + gains * c, data.matrix(gains)
+    one, other, both = (make(series, None).measured for series in (*z.T, z.sum(axis=1)))
+    between = (both - one - other) / 2
+    expected = np.array([[one, between], [between, other]])
+    assert matrix == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.max(both))
 
 
 def test_periodogram_of_a_sinusoid_is_the_taper() -> None:
@@ -80,13 +105,13 @@ def test_periodogram_of_a_sinusoid_is_the_taper() -> None:
     for low, high in ((0, 1.5), (1.5, 4), (4, 10), (10, 20), (20, 40)):
         inside = (np.abs(d) >= low) & (np.abs(d) < high)
         line = width / np.pi / (width**2 + d[inside] ** 2)
-        model = line * np.exp(log_smearing(width, d[inside])[0]) * rms**2 * data.duration_s
+        model = line * np.exp(whittle.log_smearing(width, d[inside])[0]) * rms**2 * data.duration_s
         assert np.mean(data.power(1.0)[inside]) == pytest.approx(np.mean(model), rel=0.06)
 
 
 def test_skirts_are_those_of_the_line_beyond_the_reach() -> None:
     for width in (0.02, 0.3, 2.0, 12.0):
-        log_ratio = log_smearing(width, SKIRT + np.arange(8))[0]
+        log_ratio = whittle.log_smearing(width, whittle.SKIRT + np.arange(8))[0]
         assert np.mean(log_ratio) == pytest.approx(0, abs=0.02)
 
 
@@ -99,7 +124,9 @@ def line(frequency: float, ratio: float, rms: float, **changes: object) -> Compo
     return component("line", frequency, float(np.log(ratio / (1 - ratio))), rms, **changes)
 
 
-def case(*, drift: bool = False, bump: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
+@cache
+def one_axis(*, drift: bool = False, bump: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
+    """Return the periodogram of one axis in a loop, and a spectrum near to it."""
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=4096)
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
     components = [component("turbulence", 1.1, np.log(0.5), 200.0), line(39, 0.02, 15.0)]
@@ -112,41 +139,111 @@ def case(*, drift: bool = False, bump: bool = False) -> tuple[LoopPeriodogram, S
     return data, SpectrumModel((background,), tuple(components))
 
 
+@cache
+def two_axes() -> tuple[LoopPeriodogram, SpectrumModel]:
+    """Return the same of two: each has a line, a drift or turbulence, and one line lies between."""
+    record = open_record(((LINE, 0),), frames=4096)
+    y = record.measurements
+    corrections = np.random.default_rng(5).standard_normal(y.shape) + 0.1 * y[:, ::-1]
+    data = loop_periodogram(y, corrections, frame_rate_hz=RATE, stretches=[(0, record.frames)])
+    backgrounds = tuple(
+        Background(np.log(gain), np.log(40), colour, np.log(30 * W))
+        for gain, colour in ((0.7, 0.1), (1.3, 0.0))
+    )
+    slow = component("turbulence", 1.1, np.log(0.5), 280.0)
+    drift = component("drift", 20, np.log(300.0), 50.0, axis=1)
+    shared = line(41, 0.02, 35, axis=None, log_ratio=2 * np.log(25 / 35), sign=-1.0, name=7)
+    components = (slow, line(70, 0.05, 20), dataclasses.replace(slow, axis=1), drift, shared)
+    return data, SpectrumModel(backgrounds, components)
+
+
+def test_an_axis_shows_its_own_components_and_its_share_of_the_others() -> None:
+    data, spectrum = two_axes()
+    assert spectrum.unpack(spectrum.pack()) == spectrum
+    named = spectrum.unpack(np.arange(2 * 4.0 + 5 * 4.0))
+    assert named.axes == (Background(0, 1, 2, 3), Background(4, 5, 6, 7))
+    line = named.components[1]
+    assert (line.log_frequency, line.damping, line.log_power, line.log_ratio) == (12, 13, 14, 15)
+    assert spectrum.shared == (4,)
+    directions = np.array([[1, 0], [1, 0], [0, 1], [0, 1], [1, -25 / 35]])
+    assert spectrum.directions == pytest.approx(directions)
+    matrix = whittle.spectral_matrix(data, spectrum)
+    for i, sizes in enumerate(([280.0, 20.0, 35.0], [280.0, 50.0, 25.0])):
+        alone = spectrum.on(i)
+        assert alone.axes == spectrum.axes[i : i + 1]
+        assert [c.axis for c in alone.components] == [0] * 3
+        assert [np.exp(c.log_power / 2) for c in alone.components] == pytest.approx(sizes)
+        assert matrix[i, i] == pytest.approx(whittle.density(data, alone))
+    assert np.all(matrix[0, 1] < 0)  # along (1, -r)
+    apart = spectrum.exchange(4)
+    rows = (whittle.contrast(data.row(i), apart.on(i)) for i in range(2))
+    assert whittle.contrast(data, apart) == pytest.approx(sum(rows))
+
+
+def test_the_likelihood_of_two_axes_is_that_of_the_matrices() -> None:
+    data, spectrum = two_axes()
+    S = np.moveaxis(whittle.spectral_matrix(data, spectrum), -1, 0)
+    seen = np.moveaxis(data.matrix(spectrum.gains), -1, 0)
+    trace = np.trace(np.linalg.solve(S, seen), axis1=1, axis2=2)
+    value = np.sum(data.count * (np.linalg.slogdet(S)[1] + trace))
+    assert whittle.contrast(data, spectrum) == pytest.approx(value, rel=1e-12)
+
+
 def differences(function, theta: np.ndarray, step: float = 1e-5) -> np.ndarray:
     """Return the central differences of a function by each parameter."""
     steps = step * np.eye(theta.size)
     return np.array([(function(theta + h) - function(theta - h)) / (2 * step) for h in steps])
 
 
-@pytest.mark.parametrize("drift", [False, True])
-def test_gradient_and_information_of_the_likelihood(drift: bool) -> None:
-    data, spectrum = case(drift=drift, bump=True)
+def expected_data(data: LoopPeriodogram, spectrum: SpectrumModel) -> LoopPeriodogram:
+    """Return the periodogram that is the model, of a loop without corrections."""
+    matrix, zero = whittle.spectral_matrix(data, spectrum), np.zeros_like(data.crossed)
+    measured = np.einsum("iif->if", matrix).reshape(zero.shape)
+    between = data.between
+    if between is not None:
+        between = np.zeros_like(between)
+        between[0, 0] = matrix[0, 1]
+    known = {"measured": measured, "crossed": zero, "corrected": zero, "between": between}
+    return dataclasses.replace(data, **known)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [partial(one_axis, bump=True), partial(one_axis, drift=True, bump=True), two_axes],
+    ids=["one axis", "a drift", "two axes"],
+)
+def test_gradient_and_information_of_the_likelihood(case) -> None:
+    """The row of the one gain is of exact second derivatives; those of two axes are held."""
+    data, spectrum = case()
     theta = spectrum.pack()
 
     def gradient(theta: np.ndarray, data: LoopPeriodogram = data) -> np.ndarray:
-        return derivatives(data, spectrum.unpack(theta))[1]
+        return whittle.derivatives(data, spectrum.unpack(theta))[1]
 
-    value, slope, information = derivatives(data, spectrum)
-    assert value == pytest.approx(contrast(data, spectrum), rel=1e-12)
-    numeric = approx_fprime(theta, lambda x: contrast(data, spectrum.unpack(x)), 1e-6)
-    assert slope == pytest.approx(numeric, rel=2e-3, abs=1e-3 * np.max(np.abs(numeric)))
-    # the rows of the gain are exact second derivatives
-    row = differences(gradient, theta)[GAIN]
-    assert information[GAIN] == pytest.approx(row, rel=1e-4, abs=1e-4 * np.max(np.abs(row)))
+    value, slope, information = whittle.derivatives(data, spectrum)
+    assert value == pytest.approx(whittle.contrast(data, spectrum), rel=1e-12)
+    numeric = differences(lambda x: whittle.contrast(data, spectrum.unpack(x)), theta)
+    if len(spectrum.axes) == 2:
+        numeric[[GAIN, BACKGROUND + GAIN]] = 0
+    assert slope == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.max(np.abs(numeric)))
+    if len(spectrum.axes) == 1:
+        row = differences(gradient, theta)[GAIN]
+        assert information[GAIN] == pytest.approx(row, rel=1e-4, abs=1e-4 * np.max(np.abs(row)))
     # the others are those of the model where the data are the model
-    zero = np.zeros_like(data.crossed)
-    known = {"measured": density(data, spectrum), "crossed": zero, "corrected": zero}
-    pure = dataclasses.replace(data, **known)
-    _, flat, expected = derivatives(pure, spectrum)
-    assert flat == pytest.approx(0, abs=1e-8)
-    rows = differences(lambda x: gradient(x, pure), theta)[1:, 1:]
-    assert expected[1:, 1:] == pytest.approx(rows, rel=1e-3, abs=1e-3 * np.max(rows))
+    pure = expected_data(data, spectrum)
+    _, flat, expected = whittle.derivatives(pure, spectrum)
+    assert flat == pytest.approx(0, abs=1e-7)
+    rows = differences(partial(gradient, data=pure), theta)
+    if len(spectrum.axes) == 2:
+        gains = [GAIN, BACKGROUND + GAIN]
+        rows[gains] = rows[:, gains] = 0
+    assert expected == pytest.approx(rows, abs=1e-5 * np.max(rows))
 
 
 @pytest.mark.parametrize(("drift", "taper"), [(False, False), (True, True)])
 def test_second_derivatives_of_the_likelihood(drift: bool, taper: bool) -> None:
     """At a minimum; the slope of the table that smears lines has corners: differences see them."""
-    data, start = case(drift=drift)
+    data, start = one_axis(drift=drift)
     if not taper:
         data = dataclasses.replace(data, duration_s=None)
     search = Search(data=data)
@@ -154,12 +251,12 @@ def test_second_derivatives_of_the_likelihood(drift: bool, taper: bool) -> None:
     merged, priors = search.merge(model.spectrum), search.priors(model.spectrum)
 
     def gradient(theta: np.ndarray) -> np.ndarray:
-        return derivatives(merged, model.spectrum.unpack(theta))[1]
+        return whittle.derivatives(merged, model.spectrum.unpack(theta))[1]
 
     rows = differences(gradient, model.spectrum.pack(), 1e-4)
     free = np.ix_(priors.free, priors.free)  # but for the damping of a drift
     expected = rows[free] + np.diag(1 / priors.width[priors.free] ** 2)
-    information = observe_information(merged, model, priors).information[free]
+    information = whittle.observe_information(merged, model, priors).information[free]
     scale = np.sqrt(np.abs(np.diag(information)))
     scales = np.outer(scale, scale)
     accuracy = 2e-2 if taper else 1e-3
@@ -167,101 +264,37 @@ def test_second_derivatives_of_the_likelihood(drift: bool, taper: bool) -> None:
     assert information == pytest.approx(information.T, rel=1e-12)
 
 
-@pytest.fixture(scope="module")
-def both() -> LoopPeriodogram:
-    """Return the periodogram of two axes in a loop."""
-    record = open_record(((LINE, 0),), frames=4096)
-    y = record.measurements
-    corrections = np.random.default_rng(5).standard_normal(y.shape) + 0.1 * y[:, ::-1]
-    return loop_periodogram(y, corrections, frame_rate_hz=RATE, stretches=[(0, record.frames)])
-
-
-@pytest.fixture
-def coupled() -> SpectrumModel:
-    """Return two axes with a line, a drift and turbulence of their own, and one line along both."""
-    backgrounds = tuple(
-        Background(np.log(gain), np.log(40), colour, np.log(30 * W))
-        for gain, colour in ((0.7, 0.1), (1.3, 0.0))
-    )
-    slow = component("turbulence", 1.1, np.log(0.5), 280.0)
-    drift = component("drift", 20, np.log(300.0), 50.0, axis=1)
-    shared = line(41, 0.02, 35, axis=None, log_ratio=2 * np.log(25 / 35), sign=-1.0)
-    components = (slow, line(70, 0.05, 20), dataclasses.replace(slow, axis=1), drift, shared)
-    return SpectrumModel(backgrounds, components)
-
-
-def test_the_likelihood_of_two_axes_is_that_of_the_matrices(both, coupled) -> None:
-    S = np.moveaxis(spectral_matrix(both, coupled), -1, 0)
-    data = np.moveaxis(both.matrix(coupled.gains), -1, 0)
-    trace = np.trace(np.linalg.solve(S, data), axis1=1, axis2=2)
-    value = np.sum(both.count * (np.linalg.slogdet(S)[1] + trace))
-    assert contrast(both, coupled) == pytest.approx(value, rel=1e-12)
-    assert derivatives(both, coupled)[0] == pytest.approx(value, rel=1e-12)
-
-
-def test_axes_without_shared_resonances_are_separate(both, coupled) -> None:
-    apart = coupled.exchange(coupled.shared[0])
-    rows = (contrast(both.row(i), apart.on(i)) for i in range(2))
-    assert contrast(both, apart) == pytest.approx(sum(rows))
-    matrix = spectral_matrix(both, coupled)
-    for i in range(2):
-        assert matrix[i, i] == pytest.approx(density(both, coupled.on(i)))
-    assert np.all(matrix[0, 1] < 0)  # along (1, -r)
-
-
-def test_slopes_of_two_axes_are_those_of_differences(both, coupled) -> None:
-    numeric = differences(lambda x: contrast(both, coupled.unpack(x)), coupled.pack())
-    numeric[[GAIN, BACKGROUND + GAIN]] = 0  # the gains of two axes are held
-    slope = derivatives(both, coupled)[1]
-    assert slope == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.max(np.abs(numeric)))
-
-
-def test_information_is_the_second_derivative_where_the_data_are_the_model(both, coupled) -> None:
-    matrix, theta = spectral_matrix(both, coupled), coupled.pack()
-    zero, between = np.zeros_like(both.measured), np.zeros_like(both.between)
-    between[0, 0] = matrix[0, 1]
-    measured = np.array([matrix[0, 0], matrix[1, 1]])
-    known = {"measured": measured, "crossed": zero, "corrected": zero, "between": between}
-    pure = dataclasses.replace(both, **known)
-    _, slope, information = derivatives(pure, coupled)
-    assert slope == pytest.approx(0, abs=1e-7)
-    exact = differences(lambda x: derivatives(pure, coupled.unpack(x))[1], theta)
-    gains = [GAIN, BACKGROUND + GAIN]
-    exact[gains] = exact[:, gains] = 0  # they are held
-    assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
-
-
-def test_a_component_that_would_leave_the_band_stays_at_its_end(both, coupled) -> None:
-    """Noise that falls towards the Nyquist frequency draws a wide component beyond it."""
-    wide = Component("line", np.log(3.1), 0.0, 2 * np.log(20.0))
-    model = fit(Search(data=both, gain=1.0), coupled.exchange(1, wide))
-    assert model.spectrum.components[1].frequency < np.pi
-
-
-def rosenbrock(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def rosenbrock(x: np.ndarray, above: float = 0.0) -> tuple[float, np.ndarray, np.ndarray]:
     """Half the squared residuals of Rosenbrock's valley, and of Gauss and Newton's matrix."""
     rest = np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
     slope = np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
-    return 0.5 * float(rest @ rest), slope.T @ rest, slope.T @ slope
+    return above + 0.5 * float(rest @ rest), slope.T @ rest, slope.T @ slope
 
 
-def free(count: int) -> Priors:
-    return Priors(centre=np.zeros(count), width=np.full(count, np.inf))
+def free(count: int, **bounds: object) -> whittle.Priors:
+    return whittle.Priors(centre=np.zeros(count), width=np.full(count, np.inf), **bounds)
 
 
-def test_a_curved_valley_is_followed_to_its_end_and_a_fit_without_hope_is_given_up() -> None:
-    for start in ([-1.2, 1.0], [3.0, -20.0]):
-        found = scoring_minimum(rosenbrock, np.array(start), free(2), accuracy=1e-12)
-        assert found is not None
-        assert found[0] == pytest.approx([1, 1], abs=1e-4)
+@pytest.mark.parametrize(
+    ("start", "bounds", "minimum"),
+    [
+        ([-1.2, 1.0], {}, [1, 1]),
+        ([3.0, -20.0], {}, [1, 1]),
+        # beyond a bound it lies on it, and what else is free goes on: y = x^2 in the valley
+        ([-1.2, 1.0], {"bounds": (-9.0, np.array([0.5, 9.0]))}, [0.5, 0.25]),
+    ],
+)
+def test_a_curved_valley_is_followed_to_its_end(start, bounds, minimum) -> None:
+    found = whittle.scoring_minimum(rosenbrock, np.array(start), free(2, **bounds), accuracy=1e-15)
+    assert found is not None
+    assert found[0] == pytest.approx(minimum, abs=1e-6)
 
-    def above(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        value, slope, matrix = rosenbrock(x)
-        return value + 7.0, slope, matrix
 
-    start = np.array([-1.2, 1.0])
-    assert scoring_minimum(above, start, free(2), bound=6.9) is None
-    assert scoring_minimum(above, start, free(2), bound=9.0) is not None
+@pytest.mark.parametrize(("bound", "hopeless"), [(6.9, True), (9.0, False)])
+def test_a_fit_without_hope_is_given_up(bound: float, hopeless: bool) -> None:
+    valley, start = partial(rosenbrock, above=7.0), np.array([-1.2, 1.0])
+    found = whittle.scoring_minimum(valley, start, free(2), bound=bound)
+    assert (found is None) is hopeless
 
 
 def test_parameters_without_information_leave_the_steps_finite() -> None:
@@ -272,15 +305,7 @@ def test_parameters_without_information_leave_the_steps_finite() -> None:
         value = 0.5 * float(scale @ (x - 1) ** 2) - 1e-9 * float(np.sum(x))
         return value, scale * (x - 1) - 1e-9, np.diag(scale)
 
-    found = scoring_minimum(bowl, np.array([5.0, 4.0, 3.0, 2.0]), free(4))
+    found = whittle.scoring_minimum(bowl, np.array([5.0, 4.0, 3.0, 2.0]), free(4))
     assert found is not None
     assert np.all(np.isfinite(found[0]))
     assert found[0][0] == pytest.approx(1, abs=1e-3)
-
-
-def test_a_minimum_beyond_a_bound_lies_on_it() -> None:
-    """What else is free goes on: the valley's floor at x = 0.5 is y = 0.25."""
-    priors = dataclasses.replace(free(2), bounds=(-9.0, np.array([0.5, 9.0])))
-    found = scoring_minimum(rosenbrock, np.array([-1.2, 1.0]), priors, accuracy=1e-12)
-    assert found is not None
-    assert found[0] == pytest.approx([0.5, 0.25], abs=1e-6)

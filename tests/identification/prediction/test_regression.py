@@ -1,26 +1,19 @@
 """Predictors of least squares, with and without accelerometers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
+from support.refusals import refused
 from support.structures import structure
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import loop_record
 from lbt_synth.identification.accelerometers.readings import channels_beside
+from lbt_synth.identification.prediction import regression
 from lbt_synth.identification.prediction.comparison import WITHOUT, compare_designs
-from lbt_synth.identification.prediction.regression import (
-    TAPS,
-    channel_values,
-    lagged_moments,
-    noisier,
-    regress,
-)
 from lbt_synth.identification.prediction.residual import replay
 from lbt_synth.identification.records.record import keep_frames, split_halves
 from lbt_synth.loop import close_loop
@@ -40,14 +33,15 @@ def beside_record():
 
 
 @cache
-def regression(*, channels: bool):
+def fitted():
     _, record, model = vibrating()
-    return regress(record, model, channels=beside_record() if channels else None)
+    return regression.regress(record, model, channels=beside_record())
 
 
 @cache
 def predictor(*, channels: bool):
-    return regression(channels=channels).design()
+    _, record, model = vibrating()
+    return (fitted() if channels else regression.regress(record, model)).design()
 
 
 def left_nm2(design, controller=None, *, silent: tuple[int, ...] = ()):
@@ -66,7 +60,7 @@ def test_moments_are_those_of_the_products(runs) -> None:
     """Against the regressors written out, row by row."""
     rng = np.random.default_rng(0)
     signals, targets = rng.standard_normal((97, 3)), rng.standard_normal((97, 2))
-    moments = lagged_moments(signals, targets, runs, 5)
+    moments = regression.lagged_moments(signals, targets, runs, 5)
     frames = [k for start, stop in runs for k in range(start, stop)]
     rows = np.array([np.concatenate([signals[k - lag] for lag in range(5)]) for k in frames])
     wanted = targets[frames]
@@ -95,13 +89,11 @@ def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
     claimed_nm = table[title].replayed_nm
     assert claimed_nm**2 == pytest.approx(left_nm2(fused), rel=0.2)
     assert table[f"{title}{WITHOUT}"].replayed_nm ** 2 == pytest.approx(left_nm2(alone), rel=0.2)
-    # each channel that fails: the poles stay, the fall-back leaves what the own sensor does
+    # without channels the fall-back leaves what the own sensor does
     (fallback,) = (k for missing, k in fused.controllers.items() if missing)
     assert left_nm2(fused, fallback, silent=(0, 1, 2)) == pytest.approx(left_nm2(alone), rel=0.05)
-    loops = [close_loop(fused.hardware, k) for k in (fused.controller, fallback)]
-    assert loops[0].spectral_radius == pytest.approx(loops[1].spectral_radius, rel=1e-9)
     # and what each is worth, by the moments of the unseen half alone
-    for place, row in enumerate(channel_values(record, half, beside_record())):
+    for place, row in enumerate(regression.channel_values(record, half, beside_record())):
         assert row.channel == f"channel{place + 1}"
         assert row.without_nm > 0.98 * claimed_nm
         dead = np.sqrt(left_nm2(fused, silent=(place,)))
@@ -111,12 +103,10 @@ def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
 def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
     """The loop, its reduction apart, leaves of the record what the regression says."""
     seen, record, model = vibrating()
-    fit = regression(channels=True)
+    fit, design, runs = fitted(), predictor(channels=True), record.stretches()
     coefficients = fit.solve(range(len(fit.scales)), fit.penalty, fit.whole)
-    design = predictor(channels=True)
     loop = close_loop(design.hardware, design.controller)
     z = record.pseudo_open_loop(model.sensor_gains)
-    runs = record.stretches()
     left = replay(loop, z, runs, seen.readings[: record.frames])
     ((start, stop),) = runs
     first = start + round(record.frame_rate_hz / 2)
@@ -125,36 +115,28 @@ def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
 
 
 def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
-    """None where a penalty holds them all; else what two halves of a record lose to each other."""
-    fit = regression(channels=True)
+    """None where a penalty holds them all at the model's; else what two halves lose to each other."""
+    fit, kalman = fitted(), lbt.kalman(vibrating()[2].plant())
     assert fit.fit_share(1e30) == pytest.approx(0, abs=1e-9)
+    assert left_nm2(fit.design(1e12)) == pytest.approx(left_nm2(kalman), rel=0.02)
     penalty, signals = 1e-6, range(len(fit.scales))
     past, later = (sum(parts[1:], parts[0]) for parts in (fit.parts[:3], fit.parts[3:]))
-    apart = [
-        unseen.left(b) - seen.left(b)
-        for seen, unseen in ((past, later), (later, past))
-        for b in [fit.solve(signals, penalty, seen)]
-    ]
-    least = fit.whole.left(fit.solve(signals, penalty, fit.whole))
-    half = replace(fit, parts=fit.parts[:3])
-    assert np.mean(apart) == pytest.approx(2 * half.fit_share(penalty) * least, rel=0.3)
+    first, second, whole = (fit.solve(signals, penalty, of) for of in (past, later, fit.whole))
+    apart = later.left(first) - past.left(first) + past.left(second) - later.left(second)
+    half = replace(fit, parts=fit.parts[:3]).fit_share(penalty)
+    assert apart == pytest.approx(4 * half * fit.whole.left(whole), rel=0.3)
     assert 0 < predictor(channels=True).claims["fit_share"] < 0.1
-
-
-def test_a_large_penalty_leaves_the_filter_of_the_model() -> None:
-    stiff = regression(channels=True).design(1e12)
-    kalman = lbt.kalman(vibrating()[2].plant())
-    assert left_nm2(stiff) == pytest.approx(left_nm2(kalman), rel=0.02)
 
 
 def test_more_noise_is_trusted_less() -> None:
     """The command of white noise falls, the residual rises; all axes get the same more noise."""
     _, record, model = vibrating()
-    calm, usual = regress(record, model, noise=8.0).design(), predictor(channels=False)
+    calm, usual = regression.regress(record, model, noise=8.0).design(), predictor(channels=False)
     assert max(calm.claims["command_rms"]) < 0.8 * max(usual.claims["command_rms"])
     assert left_nm2(calm) > left_nm2(usual)
     first, second = (replace(model.axes[0], noise_nm=nm, sensor_gain=2.0) for nm in (2.0, 14.0))
-    noises_nm = [axis.noise_nm for axis in noisier(replace(model, axes=(first, second)), 8.0).axes]
+    both = replace(model, axes=(first, second))
+    noises_nm = [axis.noise_nm for axis in regression.noisier(both, 8.0).axes]
     assert np.square(noises_nm) == pytest.approx(np.array([4, 196]) + 63 * (4 + 196) / 2)
 
 
@@ -166,15 +148,13 @@ def test_gains_and_delays_that_are_not_whole() -> None:
     path = lbt.LoopHardware(frame_rate_hz=1000, modes=1, delay_frames=2.4)
     ran = lbt.integrator(path, gain=0.3).controller
     run = lbt.simulate(ran, truth, hardware=path, frames=40_000, frame_means=True)
-    record = loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=1000, delay_frames=2.4, unit="nm"
-    )
+    known = {"frame_rate_hz": 1000, "delay_frames": 2.4, "unit": "nm"}
+    record = loop_record(run.measurements[0], run.commands[0], **known)
     model = lbt.identify(record, sensor_gain=0.6)
-    design = regress(record, model).design()
     own, assumed = model.hardware, replace(truth, sensor_gain=1.0)
     exact = [
-        lbt.residual_budget(close_loop(own, one), assumed).rms_nm
-        for one in (lbt.kalman(model.plant()), design)
+        lbt.residual_budget(close_loop(own, design), assumed).rms_nm
+        for design in (lbt.kalman(model.plant()), regression.regress(record, model).design())
     ]
     limit = lbt.loop.least_residual(own, assumed).rms_nm
     assert limit < exact[1] < min(1.005 * limit, exact[0])
@@ -182,7 +162,8 @@ def test_gains_and_delays_that_are_not_whole() -> None:
 
 def test_what_is_too_short_or_dead_is_refused() -> None:
     _, record, model = vibrating()
-    with pytest.raises(ProblemError, match=f"needs {12 * TAPS} frames beyond the first"):
-        regress(keep_frames(record, np.arange(record.frames) < 900), model)
-    with pytest.raises(ProblemError, match="nothing but zeros or gaps in a, b. Leave them out"):
-        channels_beside(record, np.zeros((500, 2)), ("a", "b"))
+    brief = keep_frames(record, np.arange(record.frames) < 900)
+    words = f"needs {12 * regression.TAPS} frames beyond the first"
+    refused(lambda: regression.regress(brief, model), ProblemError, words)
+    beside = partial(channels_beside, record, np.zeros((500, 2)), ("a", "b"))
+    refused(beside, ProblemError, "nothing but zeros or gaps in a, b. Leave them out")

@@ -1,9 +1,7 @@
-"""Controllers replayed on recorded data, against runs under the truth, and which frames count."""
-
-from __future__ import annotations
+"""Controllers replayed on recorded data, against runs under the truth, and tables of them."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import league
 import numpy as np
@@ -11,27 +9,34 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.diagnoses import line_record
+from support.effort import count_calls
 from support.predictions import (
     CAMERA,
     GOOD,
+    LINES,
     PATH,
     RATE,
     SHELL,
+    SLOW,
     TILTED,
     a_plant,
     a_series,
     a_truth,
     pseudo_open_loop,
+    record_of,
     replayed_residual,
 )
 from support.refusals import require_refusals
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import loop_record, prediction_against_data
 from lbt_synth.identification.prediction.residual import estimate_residual, settled_test
+from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.models import ARModel
+from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 ONE_MODE = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-SWELL = ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
 INTEGRATOR = lbt.integrator(PATH, gain=0.3).controller
 
 
@@ -50,31 +55,25 @@ def test_the_standard_errors_are_those_of_many_nights():
     known = {"noise_nm2": noise, "noise_error_nm4": np.zeros((2, 2))}
     # of x and of y = 0.4 x, both with the same noise
     exact = np.array([1, 0.16])[:, None, None] * mixing @ mixing.T * model.rms_nm**2
-    seen, errors, paired = [], [], []
-    for _ in range(nights):
+    seen, errors = np.zeros((2, nights, 4))  # of x: each axis and both; and of x above y
+    for night in range(nights):
         x = np.column_stack([a_series(model, 1500, rng, 200) for _ in range(2)]) @ mixing.T
         w = rng.standard_normal((1500, 2)) @ np.sqrt(noise)
         one, other = (
             estimate_residual((part * x + w)[rows], stretches, **known) for part in (1.0, 0.4)
         )
-        seen.append([*one.variance_nm2, one.total_nm2])
-        errors.append([*np.sqrt(np.diag(one.error_nm4)), one.total_error_nm2])
-        paired.append(one.above(other))
-    wanted = np.array([*np.diag(exact[0]), np.trace(exact[0])])
-    seen, errors = np.array(seen), np.sqrt(np.mean(np.square(errors), axis=0))
-    scatter = np.std(seen, axis=0)
+        seen[night, :3] = *one.variance_nm2, one.total_nm2
+        errors[night, :3] = *np.sqrt(np.diag(one.error_nm4)), one.total_error_nm2
+        seen[night, 3], errors[night, 3] = one.above(other)
+    backwards, error = other.above(one)
+    assert (backwards, error) == (-seen[-1, 3], pytest.approx(errors[-1, 3], rel=1e-12))
+    wanted = np.array([*np.diag(exact[0]), np.trace(exact[0]), np.trace(exact[0] - exact[1])])
+    scatter, errors = np.std(seen, axis=0), np.sqrt(np.mean(np.square(errors), axis=0))
     # 300 nights know their scatter to 4 %, and their mean to scatter / 17
     np.testing.assert_allclose(scatter, errors, rtol=0.15)
     assert np.all(np.abs(np.mean(seen, axis=0) - wanted) < 4 * scatter / np.sqrt(nights))
     # without the correlation of the axes the error of the total would be too small
     assert errors[2] > 1.1 * np.hypot(errors[0], errors[1])
-    differences, paired_errors = np.transpose(paired)
-    rms = np.sqrt(np.mean(np.square(paired_errors)))
-    assert np.std(differences) == pytest.approx(rms, rel=0.15)
-    bias = np.mean(differences) - np.trace(exact[0] - exact[1])
-    assert abs(bias) < 4 * rms / np.sqrt(nights)
-    backwards, error = other.above(one)
-    assert (backwards, error) == (-differences[-1], pytest.approx(paired_errors[-1], rel=1e-12))
 
 
 def test_the_noise_of_coupled_sensors_has_common_errors():
@@ -88,10 +87,9 @@ def test_the_noise_of_coupled_sensors_has_common_errors():
         return replayed_residual(z, INTEGRATOR, path, **known)
 
     added = estimate(noise, error).error_nm4 - estimate(noise).error_nm4
-    more, less = (
-        [estimate(noise + sign * step).variance_nm2 for step in np.eye(2)] for sign in (0.01, -0.01)
-    )
-    slope = (np.array(more) - np.array(less)).T / 0.02
+    steps = 0.01 * np.eye(2)
+    rise = [estimate(noise + h).variance_nm2 - estimate(noise - h).variance_nm2 for h in steps]
+    slope = np.transpose(rise) / 0.02
     np.testing.assert_allclose(added, slope @ np.diag(error**2) @ slope.T, rtol=1e-6)
     # 2 s ds through the squares of the inverse, on both axes at once
     squares = np.linalg.inv(path.sensor) ** 2
@@ -105,14 +103,13 @@ def test_a_residual_far_below_zero_refutes_the_noise():
     shown, right, wrong = (
         replayed_residual(z, idle(1), ONE_MODE, noise_nm=noise_nm) for noise_nm in (7.0, 10.0, 12.0)
     )
-    assert not right.refuted
+    assert (right.refuted, wrong.refuted) == (False, True)
     assert np.isfinite(right.upper_nm)
     assert shown.text == f"{shown.rms_nm:.3g} +- {shown.rms_error_nm:.2g} nm"
     assert right.text == f"at most {right.upper_nm:.2g} nm (the noise hides it)"
     assert "more noise than the data" in wrong.text
     assert 0 < right.strehl(CAMERA) <= 1
     assert np.isnan(wrong.strehl(CAMERA))
-    assert wrong.refuted
     below = -wrong.total_nm2 / wrong.total_error_nm2
     assert below == pytest.approx(44 * np.sqrt(3600 / 2) / 100, rel=0.1)
     assert np.isnan([wrong.upper_nm, wrong.rms_nm, wrong.rms_error_nm]).all()
@@ -148,12 +145,10 @@ def test_a_residual_below_its_noise_is_not_cut_off():
 )
 def test_a_replay_is_the_run_that_there_would_have_been(delay, gain, mirror, sensor, method):
     """Residual and noise are those of a run, once both have forgotten where they began."""
-    plant = {"delay": delay, "mirror": mirror, "sensor": sensor}
-    path = a_plant(**plant).hardware
+    plant = a_plant(delay=delay, mirror=mirror, sensor=sensor, gain=gain)
+    path = plant.hardware
     ran = lbt.integrator(path, gain=0.15).controller
-    design = (
-        lbt.lqg(a_plant(**plant, gain=gain)) if method == "lqg" else lbt.integrator(path, gain=0.25)
-    )
+    design = lbt.lqg(plant) if method == "lqg" else lbt.integrator(path, gain=0.25)
     truth, size = a_truth(gain), {"hardware": path, "frames": 2400, "seed": 3, "settle_frames": 0}
     night = lbt.simulate(ran, truth, **size)
     would = lbt.simulate(design.controller.start(), truth, **size)  # stepped frame by frame
@@ -164,8 +159,7 @@ def test_a_replay_is_the_run_that_there_would_have_been(delay, gain, mirror, sen
     found = replayed_residual(z, design.controller, replace(path, sensor_matrix=sensed), **known)
     measured = would.measurements[0, 2000:]
     wanted = measured @ back.T
-    scale = np.max(np.abs(wanted))
-    exact = {"rtol": 0, "atol": 1e-9 * scale}
+    exact = {"rtol": 0, "atol": 1e-9 * (scale := np.max(np.abs(wanted)))}
     np.testing.assert_allclose(found.measured_nm, wanted, **exact)
     np.testing.assert_allclose(found.noise_nm2, 15.5**2 * back @ back.T)
     # and that residual is the phase of the frame before, with its noise
@@ -194,13 +188,10 @@ def test_scale_and_beginning(seed, scale, start, delay):
     known = {"noise_nm": 0.1 * scale, "stretches": [(start, 1200)]}
     other = replayed_residual(torn, new, path, **known)
     assert other.stretches == ((start + 400, 1200),)
-    for name, factor, rtol, atol in (
-        ("measured_nm", scale, 0, 1e-12),
-        ("covariance_nm2", scale**2, 1e-9, 1e-9),
-        ("total_error_nm2", scale**2, 1e-9, 0),
-    ):
-        expected = factor * getattr(one, name)
-        np.testing.assert_allclose(getattr(other, name), expected, rtol=rtol, atol=atol * factor)
+    square, check = scale**2, np.testing.assert_allclose
+    check(other.measured_nm, scale * one.measured_nm, rtol=0, atol=1e-12 * scale)
+    check(other.covariance_nm2, square * one.covariance_nm2, rtol=1e-9, atol=1e-9 * square)
+    assert other.total_error_nm2 == pytest.approx(square * one.total_error_nm2, rel=1e-9)
 
 
 def test_a_constant_needs_no_warming_up():
@@ -211,11 +202,8 @@ def test_a_constant_needs_no_warming_up():
         found, without = (
             replayed_residual(series, new.controller, path, noise_nm=0.0) for series in (z, z - 1e6)
         )
-        constant = (
-            lbt.close_loop(path, new.controller)
-            .path("phase", "residual")
-            .frequency_response([0.0])[0]
-        )
+        rejection = lbt.close_loop(path, new.controller).path("phase", "residual")
+        constant = rejection.frequency_response([0.0])[0]
         residual = found.measured_nm - 1e6 * np.sum(constant.real, axis=1)
         assert found.stretches == without.stretches
         np.testing.assert_allclose(residual, without.measured_nm, rtol=0, atol=1e-6)
@@ -250,16 +238,14 @@ def replayed(series=GOOD, path=PATH, **options):
 
 
 def test_what_cannot_be_replayed_is_refused():
-    short = "at least 400 frames beyond the first 400 .* 50"
-    sizes = r"or one per measurement \(2\); got 3"
     later = replayed(test=[(500, 2000)])
     rows = [
         (partial(replayed, noise_error_nm=-0.1), "noise_error_nm must be at least 0"),
-        (partial(replayed, noise_error_nm=[1.0, 2.0, 3.0]), sizes),
-        (partial(replayed, test=[(1950, 2000)]), short),
+        (partial(replayed, noise_error_nm=[1, 2, 3]), r"or one per measurement \(2\); got 3"),
+        (partial(replayed, test=[(1950, 2000)]), "at least 400 frames beyond the first 400 .* 50"),
         (lambda: replayed().above(later), "on the same frames only"),
     ]
-    require_refusals((call, lbt.errors.ProblemError, words) for call, words in rows)
+    require_refusals((call, ProblemError, words) for call, words in rows)
 
 
 def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
@@ -268,12 +254,156 @@ def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
     entries = {name: league.ENTRIES[name] for name in names}
     monkeypatch.setattr(league, "ENTRIES", entries)
     night = line_record()
-    league.play(
-        {"night": night, "brief": replace(night, measured=np.arange(night.frames) < 600)}, 2
-    )
+    brief = replace(night, measured=np.arange(night.frames) < 600)
+    league.play({"night": night, "brief": brief}, 2)
     failure, _, heading, *rows = capsys.readouterr().out.splitlines()
     assert failure.startswith("brief is not in the table: ")
     assert heading.split()[-1] == "night"
     assert [row[:26].strip() for row in rows] == ["Kalman", "least squares, 32 taps", names[0]]
     assert float(rows[0].split()[-1]) == 0.0
     assert float(rows[2].split()[-1]) > 20
+
+
+R = np.array([[225.0, -90.0], [-90.0, 100.0]])  # covariance of the noise [nm^2]
+
+
+def process(*coefficients, driving=5.0):
+    return ARModel(coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=RATE)
+
+
+@cache
+def two_different_axes():
+    turbulence = [process(1.97, -0.972, driving=4.0), process(0.9886, driving=50.0)]
+    known = {"turbulence": turbulence, "vibrations": LINES, "noise_nm": R, "sensor_gain": 0.6}
+    plant, rng = lbt.tip_tilt_plant(frame_rate_hz=RATE, **known), np.random.default_rng(6)
+    total = [
+        a_series(model, 20_000, rng) + a_series(line.ar_model(RATE), 20_000, rng)
+        for model, line in zip(turbulence, LINES, strict=True)
+    ]
+    noise = rng.multivariate_normal([0, 0], R, 20_000)
+    ran = lbt.integrator(plant.hardware, gain=0.25)
+    loop = lbt.close_loop(plant.hardware, ran.controller)
+    series = filter_series(loop.system, np.column_stack([*total, noise]))
+    y, u = series[:, 4:], series[:, 2:4]
+    record = loop_record(y, u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    return plant, ran, record, pseudo_open_loop(y, u, plant.hardware)
+
+
+def test_the_table():
+    plant, ran, record, z = two_different_axes()
+    kalman, hinf = lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.2, route="riccati")
+    designs = {"Kalman": kalman, "H-infinity": hinf.controller}
+    table = prediction_against_data(record, plant, designs, running=ran, imaging=CAMERA)
+    names = "what ran, best integrator, Kalman, H-infinity"
+    assert [entry.name for entry in table.entries] == [*names.split(", "), "limit of performance"]
+    assert table.notes == ()
+    for entry in table.entries[:-1]:
+        assert abs(entry.deviations) < 4, entry.name
+        assert 0.8 < entry.ratio < 1.2
+        assert entry.replayed.stretches == table.test
+        assert entry.strehl == pytest.approx(entry.model_strehl, abs=0.1)
+        assert entry.strehl == pytest.approx(lbt.strehl(entry.replayed.covariance_nm2, CAMERA))
+        np.testing.assert_allclose(entry.replayed.noise_nm2, R / 0.36, rtol=1e-12)
+    assert table["Kalman"].model_nm == pytest.approx(kalman.rms, rel=1e-9)
+    assert table["H-infinity"].model_nm == pytest.approx(hinf.rms, rel=1e-9)
+    limit = table["limit of performance"]
+    assert limit.model_nm == pytest.approx(kalman.rms, rel=1e-9)
+    np.testing.assert_allclose(limit.model_axis_nm, kalman.certificate.rms_per_output, rtol=1e-9)
+    assert (limit.replayed, limit.replayed_nm is np.nan) == (None, True)
+    assert np.isnan([limit.ratio, limit.deviations, limit.strehl]).all()
+    row = table["Kalman"].replayed  # which nothing that is causal can beat
+    assert row.total_nm2 > limit.model_nm**2 - 4 * row.total_error_nm2
+    # what ran: its own measurements on the same frames, and its replay is what it measured
+    begin, end = table.test[0]
+    assert (begin, end) == (10_001, 20_000)  # the first half is enough to warm up
+    part = record.measurements[begin:end] / 0.6
+    variance = np.mean(part**2, axis=0) - np.diag(R) / 0.36
+    np.testing.assert_allclose(table["what ran"].replayed.variance_nm2, variance, rtol=1e-9)
+    known = {"noise_nm": [15.0, 10.0], "test": [(begin, end)]}
+    again = replayed_residual(z, ran.controller, plant.hardware, **known)
+    np.testing.assert_allclose(again.measured_nm, part, rtol=0, atol=1e-7)
+    gained, error = table["what ran"].replayed.above(table["Kalman"].replayed)
+    assert gained > 4 * error
+    assert table["Kalman"].replayed_nm == table["Kalman"].replayed.rms_nm
+    best = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, truth=plant).controller)
+    exact = lbt.residual_budget(best, plant, frame_means=True)
+    assert table["best integrator"].model_nm == pytest.approx(exact.rms_nm, rel=1e-9)
+    unknown = prediction_against_data(record, plant, {})["what ran"]
+    assert unknown.model_axis_nm is None
+    assert np.isnan([unknown.model_nm, unknown.ratio, unknown.deviations]).all()
+
+
+def test_a_wrong_model_is_found_out():
+    """The model of a filter for another frequency promises what the data does not show."""
+    plant, _, record, _ = two_different_axes()
+    wrong = retuned_plant(plant, 6.0)
+    table = prediction_against_data(record, wrong, {"Kalman": lbt.kalman(wrong)})
+    row, right = table["Kalman"], lbt.kalman(plant).rms
+    assert row.deviations > 5
+    assert row.model_nm < 1.05 * right < row.replayed_nm / 1.1
+
+
+def test_replays_run_on_whole_series():
+    plant, _, _, z = two_different_axes()
+    controller = lbt.kalman(plant).controller
+    half, full = (
+        count_calls(replayed_residual, series, controller, plant.hardware, noise_nm=[15.0, 10.0])
+        for series in (z[: len(z) // 2], z)
+    )
+    assert full < 1.2 * half
+    assert full < len(z)  # no step of Python per frame
+
+
+def test_more_noise_than_the_data_has_is_a_note():
+    """On the one axis of a loop that did nothing, with a gap in its test."""
+    air, rng = process(0.99), np.random.default_rng(0)
+    z = a_series(air, 8000, rng) + 10 * rng.standard_normal(8000)
+    z[5000:5100] = np.nan
+    idle = loop_record(z, np.zeros(8000), frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    plants = [
+        lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=air, modes=1, noise_nm=noise_nm)
+        for noise_nm in (10.0, 60.0)
+    ]
+    mine = {"mine": lbt.kalman(plants[0])}
+    right, wrong = (prediction_against_data(idle, plant, mine) for plant in plants)
+    assert right.notes == ()
+    assert (right.fit, right.test) == (((2, 3951),), ((3951, 5000), (5500, 8000)))
+    (note,) = wrong.notes
+    assert "of what ran, best integrator, mine: its variance is" in note
+    assert "4 standard errors below zero" in note
+    for entry in wrong.entries[:-1]:
+        assert entry.replayed.refuted
+        assert np.isnan(entry.replayed.upper_nm)
+
+
+def make_table(record=None, plant=None, controllers=None, **options):
+    """Compare what is predicted with data, with changed arguments."""
+    seen = record_of(GOOD, PATH) if record is None else record
+    return prediction_against_data(seen, plant or a_plant(), controllers or {}, **options)
+
+
+def test_what_cannot_be_compared_is_refused():
+    one = loop_record(GOOD[:, 0], frame_rate_hz=RATE, unit="nm")
+    rows = [
+        (partial(make_table, controllers={"best integrator": INTEGRATOR}), "may be called"),
+        (partial(make_table, one), "2 modes at 800 Hz and 1 axes"),
+        (partial(make_table, GOOD), "expected a LoopRecord"),
+        (partial(make_table, running=INTEGRATOR), "what ran needs commands"),
+        (partial(make_table, imaging=2.2), "expected an Imaging"),
+        (partial(make_table, plant=PATH), "expected a TipTiltPlant"),
+        (partial(make_table, plant=a_plant(sensor=[[1, 0], [1, 0]])), "inverted; .* of rank 1"),
+        (lambda: make_table()["mine"], "the table has the rows best integrator, .*'mine'"),
+    ]
+    require_refusals((call, ProblemError, words) for call, words in rows)
+
+
+def test_what_is_not_in_the_table_is_a_note():
+    crossed = lbt.Vibration(frequency_hz=25, damping=0.01, rms_nm=50, direction=(1, 1))
+    known = {"turbulence": SLOW, "vibrations": [LINES[0], crossed], "noise_nm": 15.5}
+    plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, delay_frames=2.4, **known)
+    one = np.eye(2)
+    wild = lbt.Controller(A=one, B=3 * one, C=one, D=0 * one, dt_s=1 / RATE)
+    table = make_table(record_of(GOOD, plant.hardware), plant, {"mine": wild})
+    assert [row.name for row in table.entries] == ["best integrator"]
+    assert "mine is unstable at the sensor gain of the model" in table.notes
+    assert "no limit of performance: a limit needs modes that decouple" in table.notes[-1]

@@ -386,12 +386,12 @@ def test_two_answers_stop_a_study(tmp_path, monkeypatch):
     study = load_small_study(
         tmp_path, controllers=FIXED, parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}"
     )
-    real = evaluation.ensemble_residuals
+    real = evaluation.ensemble_columns
 
-    def wrong(matrices, hardware, ensemble):
-        residuals = real(matrices, hardware, ensemble)
-        return replace(residuals, noise_nm2=1.001 * residuals.noise_nm2)
+    def wrong(*loops):
+        columns = real(*loops)
+        return {**columns, "noise_nm": 1.001 * columns["noise_nm"]}
 
-    monkeypatch.setattr(evaluation, "ensemble_residuals", wrong)
+    monkeypatch.setattr(evaluation, "ensemble_columns", wrong)
     with pytest.raises(lbt.errors.CertificateError, match="row 14 has slow.*by itself"):
         evaluate_samples(study, study.values(10, 16)[:8], 11)
