@@ -55,16 +55,16 @@ def test_names_of_files_cannot_command_the_terminal(tmp_path, capsys, monkeypatc
         assert all(printable(line) == line for line in (out + error).splitlines())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_says_what_is_kept(monkeypatch, capsys, tmp_path, number):
-    """Shells may ignore an interruption."""
+SIGNALS = [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+
+
+@pytest.mark.parametrize(("number", "status", "word"), SIGNALS)
+def test_a_signal_says_what_is_kept(monkeypatch, capsys, tmp_path, number, status, word):
     stop = lambda *_, **__: signal.raise_signal(number)  # noqa: E731
     for call in ("lbt_synth.cli.design.run_show", "lbt_synth.studies.run_study"):
         monkeypatch.setattr(call, stop)
+    # shells may ignore an interruption
     before = signal.getsignal(signal.SIGTERM), signal.signal(signal.SIGINT, default_int_handler)
-    status, word = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}[
-        number
-    ]
     end = f"lbt-synth: {word}\n"
     kept = f"lbt-synth: what is finished is kept in {tmp_path / 's'}; start it again to continue\n"
     study = ROOT / "examples" / "study.yaml"

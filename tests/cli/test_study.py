@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.commands import hear_interruptions, refuse_commands, run_done, run_json
+from support.commands import hear_interruptions, refuse_commands, run, run_done, run_json
 from support.studies import TWO, assert_whole, part_rows, read_table, study_file
 
 import lbt_synth as lbt
@@ -101,8 +101,9 @@ def test_an_interrupt_ends_it_at_once(tmp_path):
 
 def refuse_dask(capsys, folder, address, words):
     path = study_file(folder, samples="4", parameters=PARAMETERS)
-    refuse_commands(capsys, [(f"study {path} -o {folder}/out --dask {address}", words)])
-    assert not (folder / "out").exists()
+    status, _, error = run(capsys, "study", path, "-o", folder / "out", "--dask", address)
+    assert (status, words in error, (folder / "out").exists()) == (2, True, False), error
+    return error
 
 
 def test_dask_without_its_package(tmp_path, capsys, monkeypatch):
@@ -115,10 +116,10 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     address = cluster.scheduler_address
     with monkeypatch.context() as patch:
         patch.setattr(lbt, "__version__", "9.9.9")
-        words = "all workers must have lbt_synth 9.9.9, as here"
-        refuse_dask(capsys, tmp_path, address, words)
+        refuse_dask(capsys, tmp_path, address, "all workers must have lbt_synth 9.9.9, as here")
     path = study_file(tmp_path, samples="40", parameters=PARAMETERS)
-    run_done(capsys, "study", path, "-o", tmp_path / "out", "--dask", address)
+    status, _, error = run(capsys, "study", path, "-o", tmp_path / "out", "--dask", address)
+    assert status == 0, error
     assert_whole(tmp_path / "out", lbt.studies.load_study(path), evaluate_samples)
 
 
@@ -129,8 +130,9 @@ def test_no_scheduler_and_one_without_workers(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("lbt_synth.storage.executors._TIMEOUT_S", 1)
     before = time.monotonic()
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""):
-        refuse_dask(capsys, tmp_path, address, "no Dask scheduler answers at")
+        error = refuse_dask(capsys, tmp_path, address, "no Dask scheduler answers at")
+        assert error.count("\n") == 1
     assert time.monotonic() - before < 40
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
-        words = "has no workers; start some with"
-        refuse_dask(capsys, tmp_path, empty.scheduler_address, words)
+        address = empty.scheduler_address
+        refuse_dask(capsys, tmp_path, address, "has no workers; start some with")

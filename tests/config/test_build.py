@@ -28,7 +28,7 @@ def edited(source, old, new):
     return source.replace(old, new)
 
 
-def test_every_kind_of_turbulence_noise_and_direction(tmp_path, config):
+def test_every_kind_of_turbulence_noise_line_and_truth(tmp_path, config):
     given = {"kind": "ar", "coefficients": [0.9, 0.05], "driving_rms_nm": 3.0}
     line = {"direction_deg": 30.0, "frequency_hz": 20.0, "damping": 0.01, "rms_nm": 5.0}
     ar, mas, turned, shaken = (
@@ -163,11 +163,8 @@ def test_a_file_describes_its_sensors(sensors_config, tmp_path):
     assert np.allclose(factor @ factor.T, [[4e-8, 2e-8], [2e-8, 4e-8]])
 
 
-LINE, BANDWIDTH, GAIN = (
-    "kind: sinusoid,",
-    "    bandwidth_hz: 100.0",
-    "    proportional_per_s2: 4.0e5",
-)
+LINE, BANDWIDTH = "kind: sinusoid,", "    bandwidth_hz: 100.0"
+GAIN = "    proportional_per_s2: 4.0e5"
 PYRAMID = LBT[LBT.index("  pyramid:") : LBT.index("mirror:")]
 CHANNELS, MATRIX = "channels: [m1, m2]", "  matrix: [[1, 0], [0, 2]]\n"
 

@@ -42,11 +42,8 @@ def test_only_nanometres_change_until_the_command_ends_even_if_it_fails():
 
 
 def test_tables_change_with_their_digits_and_records_do_not():
-    assert [display_unit.shown_format(".1f", factor) for factor in (0.1, 1 / 2055)] == [
-        ".2f",
-        ".4f",
-    ]
-    assert display_unit.shown_format(".3g", 0.1) == ".3g"
+    given = ((".1f", 0.1), (".1f", 1 / 2055), (".3g", 0.1))
+    assert [display_unit.shown_format(*pair) for pair in given] == [".2f", ".4f", ".3g"]
     assert row_table("t", [ROW]).headings[1] == "residual [nm]"
     with display_unit.own_display_unit():
         display_unit.show_in("mas", 10.0)
