@@ -144,9 +144,11 @@ class Report:
             table = [""] * bool(verdict) + thinned
             if len(table) <= most:
                 break
-        more = [line for note in notes for line in _wrapped(note, room)]
-        lines = verdict + table[:most] + kept + more
-        if len(lines) > space or len(table) > most:
+        lines, more = verdict + table[:most] + kept, [_wrapped(note, room) for note in notes]
+        hidden = len(lines) + sum(map(len, more)) > space or len(table) > most
+        while more and len(lines) + len(more[0]) <= space - hidden:  # no sentence is cut
+            lines += more.pop(0)
+        if hidden:
             lines = [*lines[: space - 1], "... more with --verbose"]
         return lines + written
 

@@ -1,15 +1,10 @@
 """Designs for the LBT that the tests of all exports share."""
 
 import pytest
-from support.exports import lbt_config, lbt_designs
+from support.exports import lbt_designs
 
 import lbt_synth as lbt
 from lbt_synth.interop import proof
-
-
-@pytest.fixture
-def loaded():
-    return lbt_config()
 
 
 @pytest.fixture

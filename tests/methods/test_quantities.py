@@ -32,8 +32,8 @@ def declared_numbers(annotation, bounds=(), path=""):
     elif annotation in (int, float):
         limits = [getattr(bound, "metadata", None) or [bound] for bound in bounds]
         yield path, [one for some in limits for one in some]
-    for part in get_args(annotation):
-        yield from declared_numbers(part, bounds, path)
+    for argument in get_args(annotation):
+        yield from declared_numbers(argument, bounds, path)
 
 
 def test_every_number_of_the_schema_has_limits():

@@ -23,10 +23,7 @@ def chromium(profile, *hosts):
 
 
 def opened(browser, address, screen=DESK):
-    """Open a page and wait for all of it; its log begins with it.
-
-    The driver may return from a page that was open already while it is read again.
-    """
+    """Open a page and wait for all of it, though it was open already; its log begins with it."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     browser.get("about:blank")

@@ -29,7 +29,6 @@ def run_done(capsys, *arguments):
 
 
 def run_json(capsys, *arguments):
-    """What a command says to programs."""
     return json.loads(run_done(capsys, *arguments, "--json"))
 
 

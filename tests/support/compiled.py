@@ -8,15 +8,8 @@ import subprocess
 
 import numpy as np
 
-STRICT = [
-    "-std=c99",
-    "-pedantic",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-    "-Wdouble-promotion",
-    "-Wconversion",
-]
+STRICT = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion"]
+STRICT += ["-Wconversion"]
 PLAIN = ["-O2", "-ffp-contract=off"]  # each product and each sum is rounded
 _fresh = itertools.count()
 _compiled = {}
@@ -41,29 +34,19 @@ def build(source):
     return ctypes.CDLL(str(target))
 
 
-def header_numbers(source, name):
-    """Return the whole numbers that a header defines, by name without the prefix."""
-    found = re.findall(
-        rf"{name.upper()}_(\w+) (?:= )?(\d+)\b", source.with_suffix(".h").read_text()
-    )
-    return {key: int(value) for key, value in found}
-
-
 class Compiled:
-    """One instance of an exported controller: its functions, its own state.
+    """One instance of an exported controller: its functions, its own state."""
 
-    One of several sensors is stepped with what is new and the applied commands, one in estimator
-    form with the applied commands.
-    """
-
-    def __init__(self, source, *, name=None, single=False, library=None):
+    def __init__(self, source, *, name=None, single=False):
         self.name = name or source.stem
         self.real = np.float32 if single else np.float64
-        self.library = build(source) if library is None else library
-        self.numbers = header_numbers(source, self.name)
+        self.library = build(source)
+        header = source.with_suffix(".h").read_text()
+        numbers = re.findall(rf"{self.name.upper()}_(\w+) (?:= )?(\d+)\b", header)
+        self.numbers = {key: int(value) for key, value in numbers}
         size = self.numbers["STATES"] + self.numbers["COMMANDS"]
         self.masked = "SENSORS" in self.numbers
-        self.estimator = "*applied" in source.with_suffix(".h").read_text()
+        self.estimator = "*applied" in header
         if self.masked:  # a flag and a phase
             size += 8 // self.real().nbytes
         self.state = np.full(size, 7.0, dtype=self.real)  # what was in the memory before
@@ -83,10 +66,7 @@ class Compiled:
         getattr(self.library, f"{self.name}_phase")(at, ctypes.c_ulong(frames))
 
     def step(self, y, *given):
-        """Take measurements, what is new of them and applied commands; return the commands.
-
-        By default its own commands were applied.
-        """
+        """Take measurements, what is new and applied commands (its own); return the commands."""
         given = given or ([self.u] if self.estimator else [])
         arrays = [np.array(y, dtype=self.real)]
         assert arrays[0].shape == (self.numbers["MEASUREMENTS"],)

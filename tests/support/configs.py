@@ -2,6 +2,8 @@
 
 import copy
 import re
+from functools import reduce
+from operator import getitem
 
 from ruamel.yaml import YAML
 from support.plants import LBT_YAML
@@ -20,21 +22,16 @@ def write_config(tmp_path, content):
 
 
 def with_errors(text, *errors_hz):
-    """The text of a configuration with other errors of the frequency."""
     return re.sub(r"errors_hz: .*", f"errors_hz: {list(errors_hz)}", text)
 
 
 def change_key(path, value):
     """A copy of the good file with one key set (or taken away, with ``...``)."""
-    out = copy.deepcopy(GOOD)
-    here = out
-    *steps, last = path
-    for step in steps:
-        here = here[step]
+    out, (*steps, last) = copy.deepcopy(GOOD), path
+    section = reduce(getitem, steps, out)
+    section[last] = value
     if value is ...:
-        del here[last]
-    else:
-        here[last] = value
+        del section[last]
     return out
 
 

@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import numpy as np
 from support.recorded_loops import LINE, RATE, spliced_record
 
 import lbt_synth as lbt
@@ -27,17 +26,14 @@ def given_design():
     (frequency, damping, rms), *_ = LINE
     line = lbt.Vibration(frequency_hz=frequency, damping=damping, rms_nm=rms, direction=(1,))
     air = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=1.0, frame_rate_hz=RATE)
-    return lbt.kalman(
-        lbt.tip_tilt_plant(
-            frame_rate_hz=RATE, turbulence=air, vibrations=[line], noise_nm=2.0, modes=1
-        )
-    )
+    models = {"turbulence": air, "vibrations": [line], "noise_nm": 2.0}
+    return lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=RATE, modes=1, **models))
 
 
-def short_record(change=1.0, *, frames=1000, axes=1):
+def short_record(change=1.0):
     """A record that is too short for a model, with its commands changed."""
     record = line_record()
-    y, u = (np.hstack([x[:frames]] * axes) for x in (record.measurements, record.commands))
+    y, u = (series[:1000] for series in (record.measurements, record.commands))
     return lbt.identification.loop_record(
         y, change * u, frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )

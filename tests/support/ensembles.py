@@ -22,14 +22,8 @@ def plant(**changes):
 
 def weather(count, seed=0):
     rng = np.random.default_rng(seed)
-    return {
-        "gains": rng.uniform(0.3, 1.2, count),
-        "delays": rng.choice([1.0, 1.7, 2.0, 2.2, 3.0], count),
-        "noise": rng.uniform(5, 30, count),
-        "seeing": rng.uniform(0.5, 1.5, count),
-        "wind": rng.uniform(8, 30, count),
-        "scale": rng.uniform(12, 60, count),
-        "frequency": rng.uniform(18, 22, count),
-        "rms": rng.uniform(300, 900, count),
-        "damping": rng.uniform(0.002, 0.02, count),
-    }
+    conditions = {"gains": rng.uniform(0.3, 1.2, count)}
+    conditions["delays"] = rng.choice([1.0, 1.7, 2.0, 2.2, 3.0], count)
+    ranges = {"noise": (5, 30), "seeing": (0.5, 1.5), "wind": (8, 30), "scale": (12, 60)}
+    ranges |= {"frequency": (18, 22), "rms": (300, 900), "damping": (0.002, 0.02)}
+    return conditions | {name: rng.uniform(*ends, count) for name, ends in ranges.items()}

@@ -1,11 +1,8 @@
 """The example on the vibration spectrum of VLT/ERIS: its module, its record, and the model of it."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import sys
-from types import ModuleType
 
 from support.plants import ROOT
 
@@ -15,10 +12,9 @@ ERIS_FILE = ROOT / "examples" / "data" / "eris_vibrations_psd.fits"
 
 
 @functools.cache
-def eris_example() -> ModuleType:
-    spec = importlib.util.spec_from_file_location(
-        "eris_vibrations", ROOT / "examples" / "eris_vibrations.py"
-    )
+def eris_example():
+    path = ROOT / "examples" / "eris_vibrations.py"
+    spec = importlib.util.spec_from_file_location("eris_vibrations", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules["eris_vibrations"] = module  # its dataclass looks there
     spec.loader.exec_module(module)
@@ -26,10 +22,10 @@ def eris_example() -> ModuleType:
 
 
 @functools.cache
-def eris_record() -> lbt.identification.SpectrumRecord:
+def eris_record():
     return eris_example().record()
 
 
 @functools.cache
-def eris_model() -> lbt.identification.IdentifiedModel:
+def eris_model():
     return lbt.identify(eris_record(), frame_rate_hz=1000, delay_frames=2)

@@ -50,12 +50,10 @@ if (final) widget.value_throttled = value;
 
 
 def text_of(browser, name):
-    """Return what a part of the page says."""
     return browser.execute_script(f"return {MODEL}(arguments[0]).text", name)
 
 
 def await_true(condition, *, within_s=60):
-    """Wait until something is so."""
     end = time.monotonic() + within_s
     while not condition():
         assert time.monotonic() < end
@@ -78,11 +76,9 @@ def move(browser, key, part, *, final=True):
 
 
 def choose(browser, method):
-    """Choose a method, and return the verdict on its design."""
     return move(browser, "method", method, final=False)
 
 
 def press(browser, name):
-    """Press a button."""
     event = "new (Bokeh.require('core/bokeh_events').ButtonClick)()"
     browser.execute_script(f"{MODEL}(arguments[0]).trigger_event({event})", name)

@@ -16,40 +16,21 @@ from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 @functools.cache
 def odd_plant():
     """A plant whose sensor, mirror, noise and delay are not the simplest."""
-    plant = lbt_axis_plant(modes=2)
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=800,
-        turbulence=plant.turbulence,
-        vibrations=plant.vibrations,
-        noise_nm=[15.5, 20.0],
-        delay_frames=2.5,
-        sensor_matrix=[[1.1, 0.1], [-0.1, 0.9]],
-        influence_matrix=[[0.9, 0.0], [0.1, 1.2]],
-    )
+    matrices = {"sensor_matrix": [[1.1, 0.1], [-0.1, 0.9]]}
+    matrices["influence_matrix"] = [[0.9, 0.0], [0.1, 1.2]]
+    return slow_plant(2.5, modes=2, noise_nm=[15.5, 20.0], **matrices)
 
 
 def bare_problem():
-    return lbt.EstimationProblem(
-        A=[[1.9, -0.99], [1.0, 0.0]],
-        B=[[1.0, 0.0], [0.0, 0.0]],
-        C=[[0.0, 1.0]],
-        D=[[0.0, 3.0]],
-        L=[[1.0, 0.0]],
-        dt_s=0.002,
-    )
+    A, B, D = [[1.9, -0.99], [1.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[0.0, 3.0]]
+    return lbt.EstimationProblem(A=A, B=B, C=[[0.0, 1.0]], D=D, L=[[1.0, 0.0]], dt_s=0.002)
 
 
 def sensors_original(*, bounded):
     """A filter of a slow sensor and an accelerometer beside the loop's own sensor."""
     slow = WavefrontSensor(name="slow", rate_hz=400, delay_frames=2, noise_nm=9.0)
-    shaken = Accelerometer(
-        name="mirror",
-        rate_hz=800,
-        delay_frames=1.5,
-        channels=("m1",),
-        noise_m_s2=2e-3,
-        highpass_hz=1.0,
-    )
+    facts = {"channels": ("m1",), "noise_m_s2": 2e-3, "highpass_hz": 1.0}
+    shaken = Accelerometer(name="mirror", rate_hz=800, delay_frames=1.5, **facts)
     own = odd_plant()
     motions = ({"m1": Motion(size=2.0, phase_deg=20.0)},) * len(own.vibrations)
     plant = own.with_sensors(SensorSuite(sensors=(slow, shaken)), motions)

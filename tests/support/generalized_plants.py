@@ -15,6 +15,7 @@ def random_plant(seed, *, n=None, D22=True, D12=None, D21=None):
     n = int(rng.integers(2, 21)) if n is None else n
     m1, m2, p1, p2 = (int(rng.integers(1, 4)) for _ in range(4))
     m1, p1 = max(m1, p2), max(p1, m2)
+    D12, D21 = (1.0 if factor is None else factor for factor in (D12, D21))
 
     def draw(*shape):
         return rng.normal(size=shape)
@@ -23,13 +24,9 @@ def random_plant(seed, *, n=None, D22=True, D12=None, D21=None):
     size = rng.uniform(0.5, 1.3)
     A = A * (size / np.max(np.abs(np.linalg.eigvals(A))))
     parts = {"A": A, "B1": draw(n, m1), "B2": draw(n, m2), "C1": draw(p1, n), "C2": draw(p2, n)}
-    parts |= {"D11": draw(p1, m1), "D12": draw(p1, m2), "D21": draw(p2, m1)}
+    parts |= {"D11": draw(p1, m1), "D12": D12 * draw(p1, m2), "D21": D21 * draw(p2, m1)}
     if D22:
         parts["D22"] = 0.3 * draw(p2, m2)
-    if D12 is not None:
-        parts["D12"] = D12 * parts["D12"]
-    if D21 is not None:
-        parts["D21"] = D21 * parts["D21"]
     return lbt.linear.GeneralizedPlant(**parts)
 
 
@@ -46,10 +43,8 @@ def sampled_plant(seed, *, n):
     A = rng.normal(size=(n, n)) - rng.uniform(0, 2) * np.eye(n)
     whole = replace(plant.whole, A=A)
     _, controls, _, measurements = plant.sizes
-    continuous = control.ss(whole.A, whole.B, whole.C, whole.D)
-    return lbt.linear.GeneralizedPlant.of(
-        sampled(continuous), measurements=measurements, controls=controls
-    )
+    continuous = sampled(control.ss(whole.A, whole.B, whole.C, whole.D))
+    return lbt.linear.GeneralizedPlant.of(continuous, measurements=measurements, controls=controls)
 
 
 def lightly_damped_plant(seed):

@@ -26,9 +26,3 @@ def variance(hardware, *, frame_means=True, **truth):
     """Return the least variance, by default of means over frames, of which theory speaks."""
     limit = lbt.loop.least_residual(hardware, lbt.Truth(**truth), frame_means=frame_means)
     return float(limit.variance_nm2.sum())
-
-
-def budget(design, truth, hardware=None, *, frame_means=True):
-    hardware = design.hardware if hardware is None else hardware
-    loop = lbt.close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    return lbt.residual_budget(loop, truth, frame_means=frame_means)

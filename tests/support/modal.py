@@ -1,17 +1,13 @@
 """Turbulence and vibrations of many modes."""
 
-from __future__ import annotations
-
 import functools
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import block_diag
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.loop.budget import ensemble_residuals
-from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
-from lbt_synth.loop.evaluator import textbook_matrices
 
 RATE = 800.0
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
@@ -19,12 +15,12 @@ HUM = lbt.Vibration(frequency_hz=55, damping=0.02, rms_nm=40.0, direction=(1,))
 
 
 @functools.cache
-def tip_tilt_filter(delay_frames: float = 2.0) -> lbt.design.FilterDesign:
+def tip_tilt_filter(delay_frames=2.0):
     """The Kalman filter of the LBT's numbers on both axes."""
     return lbt.kalman(lbt_axis_plant(modes=2, delay_frames=delay_frames))
 
 
-def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ARModel:
+def some_air(n, order=1, seed=0):
     rng = np.random.default_rng(seed)
     if order == 1:
         coefficients = rng.uniform(0.9, 0.995, (n, 1))
@@ -37,15 +33,9 @@ def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ARModel:
 
 
 def single_plant(air, mode, lines, noise, gain, **path):
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE,
-        turbulence=air.take(mode),
-        vibrations=lines,
-        noise_nm=float(noise),
-        sensor_gain=float(gain),
-        modes=1,
-        **path,
-    )
+    models = {"turbulence": air.take(mode), "vibrations": lines, "noise_nm": float(noise)}
+    path |= {"frame_rate_hz": RATE, "modes": 1}
+    return lbt.tip_tilt_plant(sensor_gain=float(gain), **models, **path)
 
 
 def path_of(**options):
@@ -53,32 +43,21 @@ def path_of(**options):
     return lbt.LoopHardware(**({"frame_rate_hz": RATE} | options))
 
 
-def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None, **conditions):
+def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None, sensor_gain=1.0):
     """Return what an integrator for each mode leaves in the image, (n,), nan if unstable."""
-    path, n = (hardware or path_of()).single_mode(), len(gains)
-    lines = {mode: np.atleast_1d(some).tolist() for mode, some in (vibrations or {}).items()}
-    nothing = lbt.Vibration(frequency_hz=20, damping=0.5, rms_nm=1e-9)
-    moving = []
-    for i in range(max(map(len, lines.values()), default=0)):
-        each = [some[i] if len(some := lines.get(mode, [])) > i else nothing for mode in range(n)]
-        frequency_hz = np.array([line.frequency_hz for line in each])
-        moving.append(
-            EnsembleVibration(
-                frequency_hz=frequency_hz,
-                rms_nm=[line.rms_nm for line in each] / np.sinc(frequency_hz * path.dt_s),
-                damping=[line.damping for line in each],
-                direction=(1.0,),
-            )
-        )
-    ensemble = LoopEnsemble(
-        loops=n,
-        turbulence=[air],
-        noise_nm=np.broadcast_to(noise_nm, n)[:, None],
-        vibrations=tuple(moving),
-        **conditions,
-    )
-    controllers = [lbt.Controller(A=1.0, B=g, C=1.0, D=0.0, dt_s=path.dt_s) for g in gains]
-    return ensemble_residuals(textbook_matrices(controllers), path, ensemble).rms_nm
+    path, residuals = (hardware or path_of()).single_mode(), []
+    conditions = (np.broadcast_to(values, len(gains)) for values in (noise_nm, sensor_gain))
+    for mode, (gain, noise, sensor) in enumerate(zip(gains, *conditions, strict=True)):
+        law = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=path.dt_s)
+        lines = [
+            replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz * path.dt_s))
+            for line in np.atleast_1d((vibrations or {}).get(mode, []))
+        ]
+        facts = {"vibrations": lines, "noise_nm": float(noise), "sensor_gain": float(sensor)}
+        loop = lbt.close_loop(path, law, sensor_gain=float(sensor))
+        truth = lbt.Truth(turbulence=air.take(mode), **facts)
+        residuals.append(lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else np.nan)
+    return np.array(residuals)
 
 
 def joint_controller(parts, n):
@@ -95,19 +74,17 @@ def joint_controller(parts, n):
 
 def integrator_run(gains, total, noise, *, sensor_gain=1.0, hardware=None):
     """Return measurements and commands, (frames, n) each, of an integrator for each mode."""
-    hardware = (hardware or path_of()).single_mode()
-    sensor_gains = np.broadcast_to(sensor_gain, len(total))
-    runs = [
-        lbt.simulate(
-            lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=hardware.dt_s),
-            lbt.loop.Disturbance(
-                phase_nm=phase[:, None], noise=own[:, None], sensor_gain=real, frame_means=True
-            ),
-            hardware=hardware,
+    path = (hardware or path_of()).single_mode()
+    runs = []
+    for gain, phase, own, real in zip(
+        gains, total, noise, np.broadcast_to(sensor_gain, len(total)), strict=True
+    ):
+        law = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=path.dt_s)
+        facts = {"noise": own[:, None], "sensor_gain": real, "frame_means": True}
+        runs.append(
+            lbt.simulate(law, lbt.loop.Disturbance(phase_nm=phase[:, None], **facts), hardware=path)
         )
-        for gain, phase, own, real in zip(gains, total, noise, sensor_gains, strict=True)
-    ]
     return tuple(
-        np.stack([getattr(run, name)[0, :, 0] for run in runs], axis=1)
-        for name in ("measurements", "commands")
+        np.stack([series[0, :, 0] for series in kind], axis=1)
+        for kind in zip(*((run.measurements, run.commands) for run in runs), strict=True)
     )

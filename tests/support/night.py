@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from support.recorded_loops import RATE, slow
+from support.recorded_loops import RATE, record_of, slow
 
 import lbt_synth as lbt
 
@@ -11,7 +11,6 @@ LINE_HZ, LINE_NM, NOISE, GAIN = 31.0, 60.0, 8.0, 0.7
 
 @cache
 def simulated_night():
-    """The simulation, its hardware and the integrator."""
     path = lbt.LoopHardware(frame_rate_hz=RATE)
     line = lbt.Vibration(frequency_hz=LINE_HZ, damping=0.005, rms_nm=LINE_NM, direction=(1.0, 0.0))
     truth = lbt.Truth(turbulence=slow(), vibrations=(line,), noise_nm=NOISE, sensor_gain=GAIN)
@@ -22,10 +21,4 @@ def simulated_night():
 def night_record():
     """The record of the simulated night, as telemetry would hold it."""
     run, path, _ = simulated_night()
-    return lbt.identification.loop_record(
-        run.measurements[0],
-        run.commands[0],
-        frame_rate_hz=path.frame_rate_hz,
-        delay_frames=path.delay_frames,
-        unit="nm",
-    )
+    return record_of(run, path)

@@ -1,7 +1,5 @@
 """Continuous oscillators, shaken by kicks within each frame, without the package's sampling."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,10 +49,7 @@ class KickedOscillator:
         return self._integral(1.0), np.array([self._integral(1 - s)[1] for s in times]) * sizes
 
     def chain(self, part: float, remembered: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return A, B of [state at the end (2), mean position, the one before, states at a part].
-
-        The states at a part of a frame are that of the newest frame and the older ones.
-        """
+        """Return A, B of [state at the end (2), mean, the one before, states at a part, newest first]."""
         size = 4 + 2 * remembered
         (over, kicked), (mean, mean_kicked) = self.at(1.0), self.mean()
         A, B = np.zeros((size, size)), np.zeros((size, kicked.shape[1]))
@@ -64,10 +59,7 @@ class KickedOscillator:
         return A, B
 
     def paths(self, part: float, frames: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean positions (frames, kicks) and states (frames, kicks, 2) at a part of frames.
-
-        Each kick of frame 0 has a path of its own, from rest.
-        """
+        """Return means (frames, kicks) and states (frames, kicks, 2) after each kick of frame 0."""
         A, state = self.chain(part, 1)
         positions, states = np.empty((frames, state.shape[1])), []
         for k in range(frames):

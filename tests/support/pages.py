@@ -1,21 +1,10 @@
 """A page with every kind of block and mark, and what tests read out of pages."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 import numpy as np
 
-from lbt_synth.report.draw import (
-    GUIDE,
-    PANEL_IN,
-    SHADE,
-    dot_style,
-    draw_map,
-    drawing,
-    line_style,
-    name_axes,
-)
+from lbt_synth.report import draw
 from lbt_synth.report.page.html import Chart, Notice, Page
 from lbt_synth.storage.tables import Cell, Table
 
@@ -26,11 +15,9 @@ VOID = {"meta", "br", "hr", "img", "input", "link"}
 class Reader(HTMLParser):
     """Elements of a page in their order, with what is inside; refuses what is not well formed."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.stack: list[str] = []
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.texts: dict[str, list[str]] = {}
+        self.stack, self.elements, self.texts = [], [], {}
         self.feed(text)
         self.close()
         assert self.stack == []
@@ -53,41 +40,40 @@ class Reader(HTMLParser):
             self.texts[tag][-1] += data
 
     def named(self, tag):
-        """Attributes of the elements of a tag."""
         return [attributes for name, attributes in self.elements if name == tag]
 
 
-def every_mark(name: str = "first") -> tuple[Chart, ...]:
+def every_mark(name="first"):
     """Charts with every kind of mark."""
     f, frequency = np.geomspace(0.1, 400, 50), ("frequency", "Hz")
-    with drawing([PANEL_IN, PANEL_IN]) as (above, below):
-        name_axes(above, frequency, ("size", "-"), xscale="log", yscale="log")
-        above.axvspan(10, 20, label="band", color="0.3", **SHADE)
-        above.fill_between(f, 0.5 / f, 2 / f, label="spread", **SHADE)
-        above.axvline(20.0, label="line at 20 Hz", linestyle=":", **GUIDE)
-        above.plot(f, 1 / f, label=name, **line_style(0))
-        above.plot(f, np.where(f < 5, np.nan, 1 / f**2), label="second", **line_style(1))
+    with draw.drawing([draw.PANEL_IN, draw.PANEL_IN]) as (above, below):
+        draw.name_axes(above, frequency, ("size", "-"), xscale="log", yscale="log")
+        above.axvspan(10, 20, label="band", color="0.3", **draw.SHADE)
+        above.fill_between(f, 0.5 / f, 2 / f, label="spread", **draw.SHADE)
+        above.axvline(20.0, label="line at 20 Hz", linestyle=":", **draw.GUIDE)
+        above.plot(f, 1 / f, label=name, **draw.line_style(0))
+        above.plot(f, np.where(f < 5, np.nan, 1 / f**2), label="second", **draw.line_style(1))
         above.vlines(f[::5], 0.5 / f[::5], 1.5 / f[::5])
-        above.plot(f[::5], 1 / f[::5], label="dots", **dot_style(3))
-        above.plot([], [], label="only named", **line_style(4))
-        _, factor = name_axes(below, frequency, ("steps", "nm"), xscale="log")
-        below.axhline(0.3, **GUIDE)
-        below.plot(f, factor / f, label=name, **line_style(0, drawstyle="steps-post"))
+        above.plot(f[::5], 1 / f[::5], label="dots", **draw.dot_style(3))
+        above.plot([], [], label="only named", **draw.line_style(4))
+        _, factor = draw.name_axes(below, frequency, ("steps", "nm"), xscale="log")
+        below.axhline(0.3, **draw.GUIDE)
+        below.plot(f, factor / f, label=name, **draw.line_style(0, drawstyle="steps-post"))
     words = {"caption": "Lines, areas, rules and spans.", "alt": "Two curves that fall."}
     lines = Chart(key="lines", title=f"Lines of {name}", figure=above.figure, **words)
     values = np.arange(30.0).reshape(5, 6)
     values[0] = np.nan
     values[3, 2] = np.nan
-    with drawing([PANEL_IN, PANEL_IN], columns=2) as panels:
+    with draw.drawing([draw.PANEL_IN, draw.PANEL_IN], columns=2) as panels:
         for panel, title in zip(panels, (name, "other"), strict=True):
-            name_axes(panel, ("error", "Hz"), ("gain", "-"), title)
+            draw.name_axes(panel, ("error", "Hz"), ("gain", "-"), title)
         grid = np.arange(6.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4]), values
-        draw_map(panels, [grid, grid], "ratio [%]", blank="unstable")
+        draw.draw_map(panels, [grid, grid], "ratio [%]", blank="unstable")
     words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
     return lines, Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
 
 
-def whole_page(name: str = "first") -> Page:
+def whole_page(name="first"):
     """A page with every kind of block."""
     table = Table(
         caption=f"Table of {name}",

@@ -4,15 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.residual import (
-    estimate_residual,
-    gather,
-    mode_noise,
-    replay,
-    settled_test,
-)
+from lbt_synth.identification.prediction import residual
 
 RATE = 800
 CAMERA = lbt.Imaging(diameter_m=8.22)
@@ -27,16 +22,9 @@ LINES = (
 
 
 def a_plant(*, delay=2.0, gain=1.0, mirror=None, sensor=None):
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE,
-        turbulence=SLOW,
-        vibrations=LINES,
-        noise_nm=15.5,
-        delay_frames=delay,
-        sensor_gain=gain,
-        sensor_matrix=sensor,
-        mirror=mirror,
-    )
+    models = {"turbulence": SLOW, "vibrations": LINES, "noise_nm": 15.5, "mirror": mirror}
+    path = {"delay_frames": delay, "sensor_gain": gain, "sensor_matrix": sensor}
+    return lbt.tip_tilt_plant(frame_rate_hz=RATE, **models, **path)
 
 
 def a_truth(gain=1.0, noise_nm=15.5):
@@ -66,25 +54,26 @@ def replayed_residual(
 ):
     """Return what a controller would have left of a series on the frames of a test."""
     runs = tuple(stretches or ((0, len(z)),))
-    kept = settled_test(runs, runs if test is None else tuple(test), hardware)
+    kept = residual.settled_test(runs, runs if test is None else tuple(test), hardware)
     noise_nm2 = np.square(noise_nm) * np.eye(hardware.n_measurements)
-    measured = gather(replay(lbt.close_loop(hardware, controller), z, runs), kept)
-    return estimate_residual(measured, kept, *mode_noise(hardware, noise_nm2, noise_error_nm))
+    measured = residual.gather(residual.replay(lbt.close_loop(hardware, controller), z, runs), kept)
+    return residual.estimate_residual(
+        measured, kept, *residual.mode_noise(hardware, noise_nm2, noise_error_nm)
+    )
 
 
 def record_of(z, hardware, *, measured=None):
     """Return the record of an open loop whose pseudo-open-loop series is z."""
+    every = np.ones(len(z), bool)
     return lbt.identification.LoopRecord(
         frame_rate_hz=hardware.frame_rate_hz,
         measurements=z @ hardware.sensor.T,
-        measured=np.ones(len(z), bool) if measured is None else measured,
-        commanded=np.ones(len(z), bool),
+        measured=every if measured is None else measured,
+        commanded=every,
     )
 
 
 def a_series(model, frames, rng, more=4000):
-    from scipy.signal import lfilter
-
     white = rng.standard_normal(frames + more)
     return lfilter([model.driving_rms_nm], np.r_[1, -model.coefficients], white)[more:]
 
@@ -98,6 +87,5 @@ CASES = [
     pytest.param(2.0, 0.6, SHELL, None, id="moving mirror"),
     pytest.param(2.25, 0.8, SHELL, TILTED, id="moving mirror, fraction, crossed sensor"),
 ]
-
 GOOD = np.random.default_rng(0).standard_normal((2000, 2))
 PATH = lbt.LoopHardware(frame_rate_hz=RATE)

@@ -6,6 +6,7 @@ import signal
 from contextlib import contextmanager
 
 import numpy as np
+import pytest
 import yaml
 
 from lbt_synth.loop.disturbances import draw_disturbance
@@ -17,10 +18,7 @@ SENSOR_HZ = 100.0  # of pyRTC's own sensor
 
 @contextmanager
 def running(folder, *, predictor=None, training=None, own_process=False):
-    """Start a folder's system and yield its telescope and its loop; end it, whatever happens.
-
-    Another predictor takes the place of ours; a training series is what it is fitted to.
-    """
+    """Start a folder's system with our predictor, or one that is fitted to a series; end it."""
     conf = yaml.safe_load((folder / "config.yaml").read_text())
     conf["loop"]["predictor"] = conf["loop"]["predictor"] if predictor is None else predictor
     if own_process:
@@ -34,25 +32,12 @@ def running(folder, *, predictor=None, training=None, own_process=False):
 
 @contextmanager
 def synthetic(folder):
-    """Yield the manager of a folder's loop on pyRTC's own sensor: images, slopes, a calibration.
-
-    The sensor runs at its own pace and sees no disturbance yet; the loop is calibrated.
-    """
+    """Yield the manager of a folder's loop, calibrated on pyRTC's own sensor in calm air."""
     conf = yaml.safe_load((folder / "config.yaml").read_text())
-    modes = conf["wfc"]["num_modes"]
     grid = {"sub_ap_spacing": 8, "sub_ap_offset_x": 0, "sub_ap_offset_y": 0}
-    conf["wfs"] = {
-        "class_name": "SyntheticSHWFS",
-        "functions": ["expose"],
-        "name": "sensor",
-        "width": 32,
-        "height": 32,
-        "dark_count": 10,
-        "num_modes": modes,
-        "frame_rate_hz": SENSOR_HZ,
-        "read_noise": 1.0,
-        **grid,
-    }
+    conf["wfs"] = {"class_name": "SyntheticSHWFS", "functions": ["expose"], "name": "sensor"}
+    conf["wfs"] |= {"width": 32, "height": 32, "dark_count": 10, "read_noise": 1.0, **grid}
+    conf["wfs"] |= {"num_modes": conf["wfc"]["num_modes"], "frame_rate_hz": SENSOR_HZ}
     conf["slopes"] = {"type": "SHWFS", "signal_type": "slopes", "functions": ["compute_signal"]}
     conf["slopes"] |= grid
     del conf["loop"]["im_file"]
@@ -70,6 +55,7 @@ def synthetic(folder):
 @contextmanager
 def built(folder, conf):
     """Build a system under stream names of its own, and clear it away."""
+    pytest.importorskip("pyrtc")
     import pyshmem
     from pyrtc.manager import RTCManager
 
@@ -128,18 +114,6 @@ def _give_up(*_):
 def drawn(truth, hardware, *, frames, seed, quiet=0):
     """Phase and noise, (1, frames, modes); both are zero in the first frames."""
     series = draw_disturbance(truth, hardware, frames=frames, seed=seed)
-    total, noise = series.phase_nm, series.noise
-    total[:, :quiet] = 0
-    noise[:, :quiet] = 0
-    return total, noise
-
-
-def pol_series(truth, hardware, *, frames, seed):
-    """What an open loop records, (frames, modes)."""
-    total, noise = drawn(truth, hardware, frames=frames, seed=seed)
-    return (total + noise)[0]
-
-
-def residual_rms(series, modes=2):
-    """Residual over all modes [nm rms], of a series of the loop."""
-    return float(np.sqrt(np.sum(np.var(series[0, :, :modes], axis=0))))
+    for values in (series.phase_nm, series.noise):
+        values[:, :quiet] = 0
+    return series.phase_nm, series.noise

@@ -6,7 +6,6 @@ import numpy as np
 from astropy.io import fits
 
 RATE = 500.0
-FRAMES = 60
 
 
 def write_csv(path, names, columns, *, sign=",", comments=()):
@@ -17,34 +16,21 @@ def write_csv(path, names, columns, *, sign=",", comments=()):
 
 
 def hdus(path, *units, **cards):
-    primary = fits.PrimaryHDU()
-    for key, value in cards.items():
-        primary.header[key] = value
-    fits.HDUList([primary, *units]).writeto(path)
+    fits.HDUList([fits.PrimaryHDU(header=fits.Header(cards)), *units]).writeto(path)
     return path
 
 
 def image(name, data, unit=None, **cards):
-    unit_hdu = fits.ImageHDU(np.asarray(data), name=name)
-    if unit:
-        unit_hdu.header["BUNIT"] = unit
-    for key, value in cards.items():
-        unit_hdu.header[key] = value
-    return unit_hdu
+    cards |= {"BUNIT": unit} if unit else {}
+    return fits.ImageHDU(np.asarray(data), name=name, header=fits.Header(cards))
 
 
 def csv(path, text=(), **columns):
-    rows = [",".join(columns)]
-    rows += [",".join(repr(float(v)) for v in row) for row in zip(*columns.values(), strict=True)]
-    path.write_text("\n".join([*(f"# {line}" for line in text), *rows]) + "\n")
-    return path
+    return write_csv(path, columns, list(columns.values()), comments=text)
 
 
 def write_sav(path, **variables):
-    """A save file of IDL with double arrays, numbers and texts, by the description of its format.
-
-    C. B. Markwardt, "Unofficial Format Specification for the IDL SAVE File", 2010.
-    """
+    """A save file of IDL: C. B. Markwardt, "Unofficial Format Specification for the IDL SAVE File"."""
 
     def padded(content):
         return content + b"\0" * (-len(content) % 4)

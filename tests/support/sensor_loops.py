@@ -15,14 +15,8 @@ LINES = (
     lbt.Vibration(frequency_hz=95, damping=0.08, rms_nm=100, direction=(1, 1)),
 )
 MOTIONS = ({"m1": Motion(size=2.0), "m2": Motion(size=0.5, phase_deg=150)}, {"m2": Motion(size=1)})
-FAST = Accelerometer(
-    name="mirror",
-    rate_hz=RATE_HZ,
-    delay_frames=2,
-    channels=("m1", "m2"),
-    noise_m_s2=[[4e-6, 1e-6], [1e-6, 9e-6]],
-    highpass_hz=3.0,
-)
+CHANNELS = {"channels": ("m1", "m2"), "noise_m_s2": [[4e-6, 1e-6], [1e-6, 9e-6]]}
+FAST = Accelerometer(name="mirror", rate_hz=RATE_HZ, delay_frames=2, highpass_hz=3.0, **CHANNELS)
 SLOW = WavefrontSensor(
     name="truth",
     rate_hz=RATE_HZ / 4,
@@ -103,9 +97,8 @@ def sinusoid_reading(hardware, sensor, motion, frequency_hz, signal):
 def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuck=0.0):
     """Return the residual (frames, runs, n) of a loop that starts at rest.
 
-    ``total`` is the phase (frames, runs, n), ``added`` what each reading has beside it: noise, and
-    the acceleration of channels (frames, runs, q). A reading that is not new is a large number.
-    Sensors that are blind read what is stuck (runs, q), or zero.
+    ``added`` is what readings (frames, runs, q) have beside the phase: noise, acceleration. What is
+    not new is a large number; sensors that are blind read what is stuck (runs, q), or zero.
     """
     hardware, suite = plant.hardware, plant.hardware.suite
     taps, frames, runs = hardware.mirror_taps, *total.shape[:2]
@@ -150,26 +143,18 @@ def impulse(frames, runs, size, entries):
 def simulated_covariances(plant, controller, *, frames=300, **loop):
     """Return the residual's covariances (n, n) by origin: turbulence, vibrations, noise.
 
-    White noise leaves the sum of the squares of what an impulse leaves, mean over the phases in
-    which it may come. All impulses run side by side.
+    They are sums of the squares of what impulses leave, mean over the phases where they come.
     """
     hardware, suite, N = plant.hardware, plant.hardware.suite, plant.period
     n, rows = hardware.modes, suite.rows(hardware)
     q = max(own.stop for own in rows.values())
-    begin = 4 * N if N > 1 else 8
-    total, added, origins = [], [], []
-
-    def add(origin, signal, direction, read, t):
-        pad = ((begin + t, N - t), (0, 0))
-        total.append(np.pad(signal[:frames], pad)[:, :, None] * direction)
-        added.append(np.pad(read[:frames], (*pad, (0, 0))))
-        origins.extend([origin] * signal.shape[1])
+    begin, none = 4 * N if N > 1 else 8, np.zeros((frames, 1, q))
+    sources = []  # origin, signals (frames, runs), their direction, and what readings have of them
 
     def drive(origin, model, direction):
         white = model.driving_rms_nm * np.eye(frames, 1)
         signal = lfilter([1.0], [1.0, *-np.asarray(model.coefficients)], white, axis=0)
-        for t in range(N):
-            add(origin, signal, direction, np.zeros((frames, 1, q)), t)
+        sources.append((origin, signal, direction, none))
 
     for mode, model in enumerate(plant.turbulence):
         drive(0, model, np.eye(n)[mode])
@@ -186,17 +171,20 @@ def simulated_covariances(plant, controller, *, frames=300, **loop):
         read = np.zeros((*signal.shape, q))
         for row, one in readings.items():
             read[:, :, row] = one
-        for t in range(N):
-            add(1, signal, direction, read, t)
-    factors = [plant.own_noise_factor]
-    factors += [each.noise_factor(n) for each in suite.sensors]
+        sources.append((1, signal, direction, read))
+    factors = [plant.own_noise_factor, *(each.noise_factor(n) for each in suite.sensors)]
     for column in block_diag(*factors).T:
+        read = none.copy()
+        read[0, 0] = column
+        sources.append((2, none[:, :, 0], np.zeros(n), read))
+    total, added, origins = [], [], []
+    for origin, signal, direction, read in sources:
         for t in range(N):
-            read = np.zeros((frames, 1, q))
-            read[0, 0] = column
-            add(2, np.zeros((frames, 1)), np.zeros(n), read, t)
-    left = run_loop(
-        plant, controller, np.concatenate(total, axis=1), np.concatenate(added, axis=1), **loop
-    )
+            pad = ((begin + t, N - t), (0, 0))
+            total.append(np.pad(signal[:frames], pad)[:, :, None] * direction)
+            added.append(np.pad(read[:frames], (*pad, (0, 0))))
+            origins += [origin] * signal.shape[1]
+    total, added = (np.concatenate(series, axis=1) for series in (total, added))
+    left = run_loop(plant, controller, total, added, **loop)
     powers = np.einsum("fri,frj->rij", left, left) / N
     return [powers[np.array(origins) == origin].sum(axis=0) for origin in range(3)]

@@ -21,16 +21,12 @@ def channel(size=12, pole=0.6, delay=2.0):
 
 
 def margin(at_least):
-    """Return the demand of a modulus margin."""
     return lbt.design.shaping.Bound(response="rejection", at_most=1 / at_least)
 
 
 def attenuation(low_hz, high_hz, at_most, sensor_gain=1.0):
-    """Return the demand of a rejection in a band."""
-    ends = {"low_hz": low_hz, "high_hz": high_hz}
-    return lbt.design.shaping.Bound(
-        response="rejection", at_most=at_most, sensor_gain=sensor_gain, **ends
-    )
+    ends = {"low_hz": low_hz, "high_hz": high_hz, "sensor_gain": sensor_gain}
+    return lbt.design.shaping.Bound(response="rejection", at_most=at_most, **ends)
 
 
 def spec(*demands, terms=(BASIC,)):
@@ -38,7 +34,6 @@ def spec(*demands, terms=(BASIC,)):
 
 
 def shaped(*demands, terms=(BASIC,), path=ONE, functions=20, states=None, **options):
-    """Return the design of a loop for terms and demands."""
     specification = spec(*demands, terms=terms)
     return lbt.design.shape(path, specification, functions=functions, states=states, **options)
 
@@ -49,14 +44,11 @@ def random_coefficients(size, seed=0):
 
 @functools.cache
 def shaped_design():
-    """A shaped design of few states."""
-    demands = (
-        margin(0.5),
-        lbt.design.shaping.CommandRms(at_most_nm=200, turbulence=SLOW, noise_nm=NOISE, rate=True),
-    )
+    shaping = lbt.design.shaping
     table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 10, 100], density_nm2_hz=[500, 20, 0.1])
     terms = (
-        lbt.design.shaping.ResidualVariance(turbulence=table, noise_nm=NOISE),
-        lbt.design.shaping.VibrationBand(low_hz=9, high_hz=11, rms_nm=50),
+        shaping.ResidualVariance(turbulence=table, noise_nm=NOISE),
+        shaping.VibrationBand(low_hz=9, high_hz=11, rms_nm=50),
     )
-    return lbt.design.shape(ONE, spec(*demands, terms=terms), functions=16, states=10)
+    rate = shaping.CommandRms(at_most_nm=200, turbulence=SLOW, noise_nm=NOISE, rate=True)
+    return shaped(margin(0.5), rate, terms=terms, functions=16, states=10)

@@ -31,15 +31,12 @@ SETUP = EndToEndSetup(  # of a bright star
 )
 # a filter for 40 Hz leaves much of a line at 44 Hz
 SHAKE = lbt.models.SinusoidalVibration(frequency_hz=44, rms_nm=60.0, direction=(0.8, 0.6))
-PLANT = lbt.tip_tilt_plant(
-    frame_rate_hz=800,
-    turbulence=lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=0.5, frame_rate_hz=800),
-    noise_nm=0.3,
-    vibrations=[
-        lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=20, direction=d)
-        for d in ((1, 0), (0, 1))
-    ],
-)
+AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=0.5, frame_rate_hz=800)
+LINES = [
+    lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=20, direction=direction)
+    for direction in ((1, 0), (0, 1))
+]
+PLANT = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=AIR, noise_nm=0.3, vibrations=LINES)
 
 
 def small_config(folder):

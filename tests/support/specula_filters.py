@@ -1,12 +1,4 @@
-"""SPECULA's state-space filter, driven as its simulation drives it, in a process of its own.
-
-The precision of SPECULA is one for a process and is chosen before its classes are imported,
-so each precision is a process of its own::
-
-    python tests/support/specula_filters.py PRECISION OUTPUT.npz CONFIG FILE ...
-"""
-
-from __future__ import annotations
+"""SPECULA's state-space filter, as its simulation drives it, in a process of one precision."""
 
 import sys
 
@@ -72,23 +64,15 @@ def commands(precision, config, files):
 
 
 def simulate_commands(controller, config):
-    """Commands in the loop of a configuration, from the first frame on."""
     loaded = lbt.load_config(config)
-    return lbt.simulate(
-        controller,
-        loaded.truth,
-        hardware=loaded.hardware,
-        frames=FRAMES,
-        seed=SEED,
-        settle_frames=0,
-    ).commands[0]
+    options = {"frames": FRAMES, "seed": SEED, "settle_frames": 0}
+    return lbt.simulate(controller, loaded.truth, hardware=loaded.hardware, **options).commands[0]
 
 
 def main(precision, output, config, *files):
-    series = commands(int(precision), config, files)
-    keyed = {f"loop{i}": loop for i, (loop, _) in enumerate(series)}
-    keyed |= {f"noise{i}": noise for i, (_, noise) in enumerate(series)}
-    np.savez(output, **keyed)
+    loops, noises = zip(*commands(int(precision), config, files), strict=True)
+    named = {f"loop{i}": loop for i, loop in enumerate(loops)}
+    np.savez(output, **named, **{f"noise{i}": noise for i, noise in enumerate(noises)})
 
 
 if __name__ == "__main__":

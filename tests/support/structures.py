@@ -1,7 +1,5 @@
 """Telescope structures whose many modes are seen by accelerometers that mix them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,35 +23,22 @@ class Structure:
     phase: np.ndarray  # (frames, 2): phi(k-1), in the rows of the measurements [nm]
 
     @property
-    def pseudo_open_loop(self) -> np.ndarray:
+    def pseudo_open_loop(self):
         """What there would be without any correction, (frames, 2) [nm]."""
         series = self.measurements.copy()
         series[2:] += self.commands[:-2]
         return series
 
-    def record(self, start: int, stop: int) -> lbt.identification.LoopRecord:
-        """Return the record of some frames."""
-        return lbt.identification.loop_record(
-            self.measurements[start:stop],
-            self.commands[start:stop],
-            frame_rate_hz=self.frame_rate_hz,
-            delay_frames=2,
-            unit="nm",
-        )
+    def record(self, start, stop):
+        series = self.measurements[start:stop], self.commands[start:stop]
+        facts = {"frame_rate_hz": self.frame_rate_hz, "delay_frames": 2, "unit": "nm"}
+        return lbt.identification.loop_record(*series, **facts)
 
 
-def structure(
-    seed: int,
-    *,
-    seconds: float = 40.0,
-    modes: tuple[int, int] = (6, 20),
-    channels: tuple[int, int] = (3, 12),
-    gain: float = 0.4,
-) -> Structure:
-    """Draw a structure of modes between 5 and 250 Hz, of damping 0.003 to 0.1, under a few forces.
+def structure(seed, *, seconds=40.0, modes=(6, 20), channels=(3, 12), gain=0.4):
+    """Draw a structure of modes of 5 to 250 Hz and damping 0.003 to 0.1, under a few forces.
 
-    Each mode moves the two axes and all channels by random factors; an integrator of a delay of
-    two frames ran.
+    Each moves both axes and all channels by random factors; an integrator of two frames ran.
     """
     rng = np.random.default_rng(seed)
     rate = float(rng.choice([500.0, 800.0, 1000.0]))
@@ -86,9 +71,7 @@ def structure(
     return Structure(rate, noise, y, u, *before)
 
 
-def _oscillator(
-    w: float, damping: float, force: np.ndarray, dt: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _oscillator(w, damping, force, dt):
     """Return position and acceleration of an oscillator under a force that holds over steps."""
     A, B = np.array([[0, 1], [-w * w, -2 * damping * w]]), np.array([[0], [1.0]])
     F, G, *_ = cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), dt)

@@ -1,16 +1,12 @@
 """Small studies for the tests."""
 
-from __future__ import annotations
-
 import textwrap
-from pathlib import Path
 
 import numpy as np
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.studies.grid import Sweep
-from lbt_synth.studies.study.study import Study
 
 # cheap to evaluate: turbulence of the model, one integrator
 BASE = """
@@ -35,7 +31,7 @@ STUDY = {
 }
 
 
-def study_file(folder: Path, *, base: str = BASE, **changes: str) -> Path:
+def study_file(folder, *, base=BASE, **changes):
     """Write a study and its configuration; changes replace keys, None leaves one out."""
     (folder / "base.yaml").write_text(textwrap.dedent(base))
     lines = [f"{k}: {v}" for k, v in {**STUDY, **changes}.items() if v is not None]
@@ -44,7 +40,7 @@ def study_file(folder: Path, *, base: str = BASE, **changes: str) -> Path:
     return path
 
 
-def load_small_study(folder: Path, **changes: str) -> Study:
+def load_small_study(folder, **changes):
     return lbt.studies.load_study(study_file(folder, **changes))
 
 

@@ -7,7 +7,3 @@ LOOPS = (lbt.LoopHardware(frame_rate_hz=RATE), lbt.LoopHardware(frame_rate_hz=RA
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
 QUICK = lbt.models.ARModel(coefficients=[1.6, -0.65], driving_rms_nm=25.0, frame_rate_hz=RATE)
 TABLE = lbt.models.TabulatedSpectrum(frequency_hz=[1, 20, 120], density_nm2_hz=[900, 400, 3])
-LINES = (
-    lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 0)),
-    lbt.models.SinusoidalVibration(frequency_hz=33, rms_nm=90, direction=(0, 1)),
-)

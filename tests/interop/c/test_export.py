@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.compiled import STRICT, Compiled, compiler
 from support.exports import bare_design, lbt_designs, relative
 from support.predictors import made
-from support.refusals import require_refusals
+from support.refusals import refused, require_refusals
 from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
@@ -22,88 +22,94 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop import pipeline, proof
 from lbt_synth.interop.c import export as c_export
 from lbt_synth.interop.c.export import frame_cost
-from lbt_synth.interop.c.terms import RunningSource, source_terms
-from lbt_synth.interop.pipeline import target_named, target_names
+from lbt_synth.interop.c.terms import RunningSource, read_source, source_terms
 from lbt_synth.interop.proof import rehearsal_error
+from lbt_synth.linear import estimator_form
 from lbt_synth.loop.simulation import Drop
 
 LIMITS = {"double": 1e-12, "single": 1e-5}
+KINDS = {"double": np.float64, "single": np.float32}
+FORMS = ("plain", "estimator")
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Function that writes ``ctl.c`` of a design and a precision, each of them once."""
+    """Function that writes ``ctl.c`` of a design, a form and a precision, each of them once."""
 
     @cache
-    def write(name, precision="double"):
+    def write(name, form="plain", precision="double"):
         target = tmp_path_factory.mktemp("exported") / "ctl.c"
-        return lbt.interop.export(target, lbt_designs()[name], "c", precision=precision)
+        options = {"form": form, "precision": precision}
+        return lbt.interop.export(target, lbt_designs()[name], "c", **options)
 
     return write
 
 
 @pytest.mark.parametrize("precision", LIMITS)
-@pytest.mark.parametrize("name", ["kalman", "hinf", "turned"])
-def test_the_rehearsal_is_the_arithmetic_of_the_source(exported, designs, name, precision):
-    """Bit for bit in the loop, and the reported error is that of the compiled source."""
-    design, single = designs[name], precision == "single"
-    written = exported(name, precision)
-    theirs = Compiled(written.files[0], single=single)
-    assert rehearsal_error(design, theirs) == written.error
-    assert 0 < written.error < LIMITS[precision]
-    if single:
-        assert written.error > 1e-9
-    terms = source_terms(design)
-    ours = RunningSource(terms.rounded() if single else terms)
-    theirs.reset()
-    for y in np.random.default_rng(6).standard_normal((50, 2)):
-        assert np.array_equal(ours.step(y), theirs.step(y))
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "turned"])
+def test_the_source_is_what_was_proved(exported, designs, name, form, precision):
+    """Bit for bit; the numbers in its text, its error in the loop and its commands are those."""
+    design, single, applies = designs[name], precision == "single", form == "estimator"
+    written = exported(name, form, precision)
+    compiled = Compiled(written.files[0], single=single)
+    assert rehearsal_error(design, compiled) == written.error < LIMITS[precision]
+    if name != "integrator":
+        assert written.error > single * 1e-9
+    names = [check.name for check in written.checks]
+    assert names[0].startswith("spectral radius at sensor gains")
+    assert (names[-1] == "spectral radius of the estimator alone") == applies
+    assert all(check.passed for check in written.checks)
+    beside = json.loads(written.files[2].read_text())
+    assert (beside["form"], beside["precision"]) == (form, precision)
+
+    exact = estimator_form(design) if applies else design.controller
+    terms = source_terms(design, form=form)
+    numbers = read_source(written.files[0].read_text(), terms)
+    pairs = (
+        (numbers.transition[0], [exact.A, exact.applied if applies else 0 * exact.B]),
+        (numbers.gains[frozenset()][0], [exact.B]),
+        (numbers.command, [exact.C, np.zeros((2, 2)) if applies else exact.D]),
+    )
+    for matrix, parts in pairs:
+        assert np.array_equal(matrix, np.hstack(parts).astype(KINDS[precision]))
+
+    compiled.reset()
+    twin = RunningSource(terms.rounded() if single else terms)
+    textbook, commands = exact.start(), []
+    for y, applied in np.random.default_rng(6).standard_normal((50, 2, 2)):
+        more = [applied] * applies
+        commands.append((textbook.step(y, *more), compiled.step(y, *more)))
+        assert np.array_equal(twin.step(y, None, *more), commands[-1][1])
+    assert relative(*np.moveaxis(commands, 1, 0)) < {"double": 1e-10, "single": 1e-3}[precision]
+    shared = y.astype(compiled.real)  # one array for all: nothing is written before it is read
+    expected = twin.step(shared, None, *[shared] * applies)
+    compiled._call("step", compiled.state, *[shared] * (2 + applies))
+    assert np.array_equal(shared, expected)
 
 
-FORMS = [{"form": form, "precision": p} for form in ("plain", "estimator") for p in LIMITS]
-
-
-@pytest.mark.parametrize("options", FORMS, ids=lambda options: "-".join(options.values()))
+@pytest.mark.parametrize("precision", LIMITS)
+@pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_what_is_not_finite_holds_command_and_state(tmp_path, designs, name, options):
+def test_what_is_not_finite_holds_command_and_state(exported, name, form, precision):
     """In arrays of their own, and where commands share one with the measurements."""
-    source = lbt.interop.export(tmp_path / "ctl.c", designs[name], "c", **options).files[0]
-    theirs, clean = (Compiled(source, single=options["precision"] == "single") for _ in range(2))
-    before, more = np.zeros(2), options["form"] == "estimator"
-    for y in np.random.default_rng(4).standard_normal((20, 2)):
-        for bad in (np.nan, np.inf, -np.inf):
-            state = theirs.state.copy()
-            for place in range(2 + 2 * more):
-                inputs = np.ones(2 + 2 * more)
-                inputs[place] = bad
-                theirs.u[:] = 99.0
-                assert np.array_equal(theirs.step(*inputs.reshape(-1, 2)), before)
-                assert theirs.status == 1
-                assert np.array_equal(theirs.state, state)
-        given = [y, before][: 1 + more]
-        both = np.array([np.nan, 1.0], dtype=theirs.real)
-        theirs._call("step", theirs.state, *[both] * (2 + more))
-        assert np.array_equal(both, before)
-        before = clean.step(*given)
-        assert np.array_equal(theirs.step(*given), before)
-        assert theirs.status == clean.status == 0
-
-
-@pytest.mark.parametrize("name", ["kalman", "turned", "sensors"])
-def test_reset_forgets(exported, sensor_files, name):
-    files = sensor_files["double"].files if name == "sensors" else exported(name).files
-    theirs, sensors = Compiled(files[0]), name == "sensors"
-    series = np.random.default_rng(4).standard_normal((20, 6 if sensors else 2))
-    runs = []
-    for _ in range(2):
-        theirs.reset()
-        more = [[fresh_in(k, ()), y[:2]] if sensors else [] for k, y in enumerate(series)]
-        runs.append([theirs.step(y, *given) for y, given in zip(series, more, strict=True)])
-        theirs.step(series[0], *([[0, 0, 0, 0], [5.0, 5.0]] if sensors else []))
-    assert np.array_equal(*runs)
-    theirs.reset()
-    if not sensors:
-        assert np.array_equal(theirs.step([np.nan, 1.0]), [0.0, 0.0])
+    source = exported(name, form, precision).files[0]
+    spoilt, clean = (Compiled(source, single=precision == "single") for _ in range(2))
+    rng, before, arrays = np.random.default_rng(4), np.zeros(2), 1 + (form == "estimator")
+    for y in rng.standard_normal((60, 2)):
+        inputs = np.array([y, before][:arrays])
+        bad = inputs.copy()
+        bad.flat[rng.integers(bad.size)] = rng.choice([np.nan, np.inf, -np.inf])
+        spoilt.u[:] = 99.0
+        assert np.array_equal(spoilt.step(*bad), before)
+        assert spoilt.status == 1
+        shared = np.array([np.nan, 1.0], dtype=spoilt.real)
+        spoilt._call("step", spoilt.state, *[shared] * (1 + arrays))
+        assert np.array_equal(shared, before)
+        before = clean.step(*inputs)
+        assert np.array_equal(spoilt.step(*inputs), before)
+        assert np.array_equal(spoilt.state, clean.state)
+        assert spoilt.status == clean.status == 0
 
 
 @st.composite
@@ -126,43 +132,46 @@ def controllers(draw):
     return lbt.Controller(A=A, B=matrix(n, q), C=matrix(m, n), D=D, dt_s=0.002)
 
 
+def operations(source):
+    """Products and sums of a step, counted in the text outside the table of gains."""
+    sums = "".join(re.findall(r"=\n([^;]*);", source.read_text().split("_step(")[1]))
+    return np.array([sums.count(" * "), sums.count(" + ") + sums.count(" - ")])
+
+
 @pytest.mark.usefixtures("short_rehearsal")
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(controller=controllers(), precision=st.sampled_from(list(LIMITS)))
 def test_any_stable_controller(tmp_path, controller, precision):
-    written = lbt.interop.export(
-        tmp_path / "any.c", bare_design(controller), "c", precision=precision
-    )
-    theirs = Compiled(written.files[0], single=precision == "single")
-    ours = controller.start()
+    design = bare_design(controller)
+    source = lbt.interop.export(tmp_path / "any.c", design, "c", precision=precision).files[0]
+    cost = frame_cost(controller)
+    assert (cost.multiplications, cost.additions) == tuple(operations(source))
+    compiled, exact = Compiled(source, single=precision == "single"), controller.start()
     series = np.random.default_rng(2).standard_normal((200, controller.B.shape[1]))
-    expected = np.array([ours.step(y) for y in series])
-    found = np.array([theirs.step(y) for y in series])
-    states = max(1.0, float(np.max(np.abs(ours.state))))
-    size = max(float(np.max(np.abs(expected))), states)
-    assert np.max(np.abs(found - expected)) < LIMITS[precision] * size
+    expected, commands = (np.array([run.step(y) for y in series]) for run in (exact, compiled))
+    largest = np.max(np.abs(np.concatenate([[1.0], exact.state, expected.ravel()])))
+    assert np.max(np.abs(commands - expected)) < LIMITS[precision] * largest
 
 
-def test_coefficients_are_exact_and_explained(exported, designs):
-    controller = designs["kalman"].controller
-    text = exported("kalman").files[0].read_text()
-    found = re.findall(r"(-?0x\S+p[+-]\d+), /\* ([ABCD])\[(\d+)\]\[(\d+)\] = (\S+) \*/", text)
-    matrices = (np.abs(getattr(controller, name)) for name in "ABCD")
-    assert len(found) == sum(np.sum((matrix > 0) & (matrix != 1)) for matrix in matrices)
-    for code, name, i, j, decimal in found:
-        value = getattr(controller, name)[int(i), int(j)]
-        assert float.fromhex(code) == value == float(decimal)
-
-
-def test_the_comment_says_where_it_comes_from(tmp_path, designs):
-    sha = "ab" * 32
-    written = lbt.interop.export(tmp_path / "k.c", designs["kalman"], "c", gain_digest=sha)
-    for file in written.files[:2]:
-        text = file.read_text()
-        for part in (lbt.__version__, "kalman (riccati)", sha, "800.0 Hz", "2.0 frames", "nm rms"):
-            assert part in text
-        assert f"{len(designs['kalman'].certificate.checks)} checks passed" in text
-    assert f'#define K_GAIN_SHA256 "{sha}"' in written.files[1].read_text()
+def test_the_comments_say_what_it_is_and_where_it_comes_from(tmp_path, designs):
+    sha, design = "ab" * 32, designs["kalman"]
+    written = lbt.interop.export(tmp_path / "k.c", design, "c", gain_digest=sha)
+    source, header = (file.read_text() for file in written.files[:2])
+    words = (lbt.__version__, "kalman (riccati)", sha, "800.0 Hz", "2.0 frames", "nm rms")
+    for word in (*words, f"{len(design.certificate.checks)} checks passed"):
+        assert word in source
+        assert word in header
+    assert f'#define K_GAIN_SHA256 "{sha}"' in header
+    several = lbt.kalman(example_plant((SLOW,)))
+    header_of_several = lbt.interop.export(tmp_path / "s.c", several, "c").files[1].read_text()
+    assert "fresh[0]     wavefront: y[0] to y[1], every frame\n" in header_of_several
+    assert "fresh[1]     truth: y[2] to y[3], every 4 frames\n" in header_of_several
+    numbers = re.findall(r"(-?0x\S+p[+-]\d+), /\* ([ABCD])\[(\d+)\]\[(\d+)\] = (\S+) \*/", source)
+    entries = np.abs(np.hstack([getattr(design.controller, name).ravel() for name in "ABCD"]))
+    assert len(numbers) == np.sum((entries > 0) & (entries != 1))
+    for code, name, i, j, decimal in numbers:
+        entry = getattr(design.controller, name)[int(i), int(j)]
+        assert float.fromhex(code) == entry == float(decimal)
 
 
 EVIL = '*/ int main(void) {} /* x\\\n*/ ??/ *\n/ #error \u202e*/ a"b \x00'
@@ -171,14 +180,10 @@ EVIL = '*/ int main(void) {} /* x\\\n*/ ??/ *\n/ #error \u202e*/ a"b \x00'
 @pytest.mark.usefixtures("short_rehearsal")
 def test_words_cannot_leave_the_comment(tmp_path, designs):
     check = lbt.design.Check(name=EVIL, value=0.0, limit=1.0, computed_by=EVIL)
-    design = replace(
-        designs["integrator"],
-        method=EVIL,
-        solver=SolverReport(route=EVIL, status=EVIL),
-        certificate=lbt.design.Certificate(
-            checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0)
-        ),
-    )
+    solver = SolverReport(route=EVIL, status=EVIL)
+    certificate = replace(designs["integrator"].certificate, checks=(check,))
+    facts = {"method": EVIL, "solver": solver, "certificate": certificate}
+    design = replace(designs["integrator"], **facts)
     source = lbt.interop.export(tmp_path / "tip-tilt.v2.c", design, "c", name="Tip_tilt2").files[0]
     Compiled(source, name="Tip_tilt2")
     code = source.read_text()
@@ -189,49 +194,50 @@ def test_words_cannot_leave_the_comment(tmp_path, designs):
 
 
 @pytest.mark.usefixtures("short_rehearsal")
-def test_what_has_no_source_is_refused(tmp_path, designs, sensors_design):
-    def write(file="k.c", design=designs["integrator"], **options):
+def test_what_has_no_source_is_refused(tmp_path, config, designs, sensors_design, monkeypatch):
+    """Overflowing products, a gain that rounds to the brink, and tables a bit too long."""
+
+    def write(design=designs["integrator"], file="k.c", **options):
         return lambda: lbt.interop.export(tmp_path / file, design, "c", **options)
 
-    names = ("", "2fast", "a b", "_x", "a__b", "ä", "x" * 26, 3, "a\n")
-    prefix = "prefix of the C names must"
-    rows = [(write(name=name), ProblemError, prefix) for name in names]
-    ending = lbt.errors.OutputError, r"must end in \.c"
-    rows += [(write(file, name="k"), *ending) for file in ("k.h", 'k".c', "..")]
+    terms = source_terms(sensors_design)
+    count = sum(np.count_nonzero(gains.any(axis=1)) for gains in terms.gains.values())
+    count *= sensors_design.problem.n_states
+    steep = bare_design(lbt.Controller(A=[[0.5]], B=[[1e30]], C=[[1e30]], D=[[0.0]]))
+    brink = lbt.integrator(config.hardware, gain=1 - 1e-8)  # stable below 1; rounds to 1
+    monkeypatch.setattr(c_export, "MOST_GAINS", count)
+    for design in (steep, brink, sensors_design):
+        for file in write(design)().files:
+            file.unlink()
+    monkeypatch.setattr(c_export, "MOST_GAINS", count - 1)
+
+    A = np.eye(320) / 2 + 1e-5
+    full = bare_design(lbt.Controller(A=A, B=np.ones((320, 1)), C=np.ones((1, 320)), D=[[0.0]]))
+    prefix, ending = "prefix of the C names must", (lbt.errors.OutputError, r"must end in \.c")
+    single = {"precision": "single"}
+    rows = [
+        (write(name=name), ProblemError, prefix)
+        for name in ("", "2fast", "a b", "_x", "a__b", "ä", "x" * 26, 3, "a\n")
+    ]
+    rows += [(write(file=file, name="k"), *ending) for file in ("k.h", 'k".c', "..")]
     rows += [
-        (write(design=sensors_design, form="plain"), ProblemError, "in estimator form alone"),
+        (write(sensors_design, form="plain"), ProblemError, "in estimator form alone"),
+        (write(form="observer"), ProblemError, "form must be one of plain, estimator"),
+        (write(steep, form="estimator"), ProblemError, "needs the design of a loop"),
         (write(precision="half"), ProblemError, "must be one of double, single"),
+        (write(full), ProblemError, "at most 100,000 numbers in C; got 103,040"),
+        (write(sensors_design), ProblemError, rf"got {count:,}, in a period of 2 frames"),
+        (write(steep, **single), NumericalError, r"\(single precision\); the commands grow"),
+        (write(brink, **single), NumericalError, "what its design promises .* spectral radius"),
     ]
     require_refusals(rows)
+    monkeypatch.setattr(c_export, "MOST_GAINS", count)
+    monkeypatch.setattr(pipeline, "LOSS", 1e-9)  # single precision is off by more
+    words = r"in a rehearsal.*Try double precision"
+    refused(write(sensors_design, **single), NumericalError, words)
     assert not list(tmp_path.iterdir())
 
 
-def test_arithmetic_that_overflows_is_refused(tmp_path):
-    """Coefficients that fit, products that do not."""
-    steep = lbt.Controller(A=[[0.5]], B=[[1e30]], C=[[1e30]], D=[[0.0]])
-    lbt.interop.export(tmp_path / "k.c", bare_design(steep), "c")
-    with pytest.raises(lbt.errors.NumericalError, match=r"\(single precision\); the commands grow"):
-        lbt.interop.export(tmp_path / "single.c", bare_design(steep), "c", precision="single")
-    assert not list(tmp_path.glob("single*"))
-
-
-def test_a_loop_that_rounding_would_break_is_refused(tmp_path, loaded):
-    brink = lbt.integrator(loaded.hardware, gain=1 - 1e-8)  # stable below 1; rounds to 1
-    lbt.interop.export(tmp_path / "k.c", brink, "c")
-    with pytest.raises(
-        lbt.errors.NumericalError, match="what its design promises .* spectral radius"
-    ):
-        lbt.interop.export(tmp_path / "single.c", brink, "c", precision="single")
-    assert not list(tmp_path.glob("single*"))
-
-
-SENSOR_FRAMES = 1200
-DROPS = (
-    Drop(unit="m1", start_s=0.1, end_s=0.301),
-    Drop(unit="slow", start_s=0.2, end_s=0.5),
-    Drop(unit="wavefront", start_s=0.25, end_s=0.3),
-    Drop(unit="m2", start_s=0.901),
-)
 UNITS = ("wavefront", "slow", "m1", "m2")
 MISSING, NOT_FINITE, NOT_DUE, NOT_APPLIED = 1, 2, 4, 8
 HELD = 2  # of a predictor
@@ -240,230 +246,126 @@ HELD = 2  # of a predictor
 @pytest.fixture(scope="module")
 def sensor_files(sensors_design, tmp_path_factory):
     folder = tmp_path_factory.mktemp("masked_c")
+    write = partial(lbt.interop.export, design=sensors_design, target="c")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(proof, "FRAMES", 500)
-        return {
-            precision: lbt.interop.export(
-                folder / f"{precision}.c", sensors_design, "c", precision=precision
-            )
-            for precision in LIMITS
-        }
+        return {kind: write(folder / f"{kind}.c", precision=kind) for kind in LIMITS}
 
 
-@pytest.fixture
-def theirs(sensor_files):
-    return Compiled(sensor_files["double"].files[0])
-
-
-def test_the_header_says_where_each_sensor_reads(tmp_path):
-    design = lbt.kalman(example_plant((SLOW,)))
-    header = lbt.interop.export(tmp_path / "k.c", design, "c").files[1].read_text()
-    assert "fresh[0]     wavefront: y[0] to y[1], every frame\n" in header
-    assert "fresh[1]     truth: y[2] to y[3], every 4 frames\n" in header
-
-
-def run_sensors(controller, config, hardware):
-    """A run in which sensors fail, alone and together; its readings and commands."""
-    return lbt.simulate(
-        controller,
-        config.truth,
-        hardware=hardware,
-        frames=SENSOR_FRAMES,
-        settle_frames=0,
-        drops=DROPS,
-    )
-
-
-@pytest.fixture(scope="module")
-def simulated(sensors_design, sensors_config):
-    """That run with the filters of the design."""
-    return run_sensors(sensors_design, sensors_config, sensors_design.hardware)
-
-
-def is_away(drop, k):
-    """Whether a sensor is missing in a frame."""
-    return drop.start_s <= k * 1e-3 + 1e-9 < drop.end_s
-
-
-def fresh_in(k, missing=None):
-    """What is new in a frame: the slow sensor is read in every second one."""
-    away = {drop.unit for drop in DROPS if is_away(drop, k)} if missing is None else missing
-    return [unit not in away and not (unit == "slow" and k % 2) for unit in UNITS]
-
-
-def test_the_commands_are_those_of_the_simulation(simulated, theirs):
-    """On the same readings and applied commands, with sensors missing."""
-    last, found = np.zeros(2), []
-    for k, (y, u) in enumerate(zip(simulated.measurements[0], simulated.commands[0], strict=True)):
-        fresh = fresh_in(k)
-        stale = np.where(np.repeat(fresh, [2, 2, 1, 1]), y, np.nan)  # nobody looks at the others
-        found.append(theirs.step(stale, fresh, last))
-        assert theirs.status == MISSING * any(is_away(drop, k) for drop in DROPS)
+def require_commands(design, truth, drops, written, limit, *, single=False):
+    """Require the commands of a simulation, and the twin's bits; return the source that ran."""
+    path, options = design.hardware, {"frames": 1200, "settle_frames": 0, "drops": drops}
+    run, rows = lbt.simulate(design, truth, hardware=path, **options), path.suite.rows(path)
+    readings = [place.stop - place.start for place in rows.values()]
+    compiled, twin = Compiled(written.files[0], single=single), written.start(np.inf)
+    last, commands = np.zeros(2), []
+    for k, (y, u) in enumerate(zip(run.measurements[0], run.commands[0], strict=True)):
+        time_s = k / path.frame_rate_hz + 1e-9
+        away = {drop.unit for drop in drops if drop.start_s <= time_s < drop.end_s}
+        fresh = [unit not in away and not (unit == "slow" and k % 2) for unit in rows]
+        stale = np.where(np.repeat(fresh, readings), y, np.nan)  # nobody looks at the others
+        commands.append(compiled.step(stale, fresh, last))
+        assert compiled.status == MISSING * bool(away)
+        expected = twin.step(stale, dict(zip(rows, fresh, strict=True)), last)
+        assert np.array_equal(commands[-1], expected)
         last = u
-    assert relative(found, simulated.commands[0]) < 1e-9
+    assert relative(commands, run.commands[0]) < limit
+    return compiled
 
 
-@pytest.mark.parametrize("precision", ["double", "single"])
-def test_with_sensors_missing_it_is_that_arithmetic(sensors_design, sensor_files, precision):
-    """Bit for bit, with what is new drawn at random."""
-    single = precision == "single"
-    theirs = Compiled(sensor_files[precision].files[0], single=single)
-    ours = sensor_files[precision].start(np.inf)
-    rng = np.random.default_rng(0)
+def test_the_commands_are_those_of_the_simulation(sensors_design, sensors_config, sensor_files):
+    drops = (
+        Drop(unit="m1", start_s=0.1, end_s=0.301),
+        Drop(unit="slow", start_s=0.2, end_s=0.5),
+        Drop(unit="wavefront", start_s=0.25, end_s=0.3),
+        Drop(unit="m2", start_s=0.901),
+    )
+    require_commands(sensors_design, sensors_config.truth, drops, sensor_files["double"], 1e-9)
+
+
+@pytest.mark.parametrize("precision", LIMITS)
+def test_what_cannot_be_used_is_missing(sensor_files, precision):
+    """Bit for bit, at random; the slow sensor is missing from when it is due until it is read."""
+    written, rng = sensor_files[precision], np.random.default_rng(0)
+    compiled = Compiled(written.files[0], single=precision == "single")
+    twin, missing, seen = written.start(np.inf), np.zeros(4, dtype=bool), set()
     for k in range(300):
         y, applied = rng.standard_normal(6), rng.standard_normal(2)
-        fresh = (rng.random(4) < 0.8) & fresh_in(k, ())
-        given = dict(zip(UNITS, fresh, strict=True))
-        assert np.array_equal(theirs.step(y, fresh, applied), ours.step(y, given, applied))
+        y[rng.random(6) < 0.1] = rng.choice([np.nan, np.inf, -np.inf])
+        lost = rng.random(2) < 0.1
+        fresh, due = rng.random(4) < 0.8, np.array([True, k % 2 == 0, True, True])
+        finite = np.logical_and.reduceat(np.isfinite(y), [0, 2, 4, 5])
+        new = dict(zip(UNITS, (fresh & due & finite).tolist(), strict=True))
+        expected = twin.step(y, new, np.where(lost, compiled.u, applied))
+        applied[lost] = np.nan
+        assert np.array_equal(compiled.step(y, fresh, applied), expected)
+        missing = np.where(due, ~(fresh & finite), missing)
+        states = np.any([missing, fresh & due & ~finite, fresh & ~due, [any(lost)] * 4], axis=1)
+        assert compiled.status == states @ [MISSING, NOT_FINITE, NOT_DUE, NOT_APPLIED]
+        seen.add(compiled.status)
+    assert len(seen) > 10
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_reading_that_is_not_finite_is_not_fresh(theirs, sensor_files, bad):
-    other = Compiled(sensor_files["double"].files[0])
-    for k, y in enumerate(np.random.default_rng(1).standard_normal((20, 6))):
-        fresh, without = fresh_in(k, ()), fresh_in(k, ("wavefront", "m2"))
-        expected = other.step(y, without, other.u)
-        y[[1, 5]] = bad
-        assert np.array_equal(theirs.step(y, fresh, theirs.u), expected)
-        assert theirs.status == MISSING | NOT_FINITE
-        assert other.status == MISSING
-        assert np.array_equal(theirs.state, other.state)
-
-
-def test_a_sensor_that_is_not_due_is_not_read(theirs, sensor_files):
-    other = Compiled(sensor_files["double"].files[0])
-    for k, y in enumerate(np.random.default_rng(2).standard_normal((20, 6))):
-        expected = other.step(y, fresh_in(k, ()), other.u)
-        assert np.array_equal(theirs.step(y, [1, 1, 1, 1], theirs.u), expected)
-        assert theirs.status == NOT_DUE * (k % 2)
-        assert other.status == 0
-
-
-def test_a_slip_of_the_phase_is_seen_and_mended(theirs, sensor_files):
+def test_a_slip_of_the_phase_is_seen_and_mended(sensor_files):
     """The slow sensor is missing from a frame in which it is due until it is read again."""
-    seen = []
+    compiled, seen = Compiled(sensor_files["double"].files[0]), []
     for k in range(8):
         if k == 5:
-            theirs.phase(10_001)  # of an odd number of frames
-        theirs.step(np.zeros(6), [1, (k + 1) % 2 == 0, 1, 1], np.zeros(2))
-        seen.append(theirs.status)
+            compiled.phase(10_001)  # of an odd number of frames
+        compiled.step(np.zeros(6), [1, (k + 1) % 2 == 0, 1, 1], np.zeros(2))
+        seen.append(compiled.status)
     slipped = [MISSING, MISSING | NOT_DUE]
-    assert seen[:5] == [*slipped, *slipped, MISSING]
-    assert seen[5:] == [MISSING | NOT_DUE, MISSING, MISSING | NOT_DUE]
-    theirs.phase(0)
-    theirs.step(np.zeros(6), [1, 1, 1, 1], np.zeros(2))
-    assert theirs.status == 0
+    assert seen == [*slipped, *slipped, MISSING, MISSING | NOT_DUE, MISSING, MISSING | NOT_DUE]
+    compiled.phase(0)
+    compiled.step(np.zeros(6), [1, 1, 1, 1], np.zeros(2))
+    assert compiled.status == 0
 
 
-def test_commands_that_are_not_finite_are_taken_for_the_last_ones(theirs, sensor_files):
-    other = Compiled(sensor_files["double"].files[0])
-    for k, y in enumerate(np.random.default_rng(3).standard_normal((10, 6))):
-        expected = other.step(y, fresh_in(k, ()), other.u)
-        assert np.array_equal(theirs.step(y, fresh_in(k, ()), [theirs.u[0], np.nan]), expected)
-        assert theirs.status == NOT_APPLIED
-    assert np.any(theirs.u)
-
-
-@pytest.mark.parametrize(
-    ("names", "found"),
-    [
+def test_names_of_sensors_that_are_no_identifiers(sensors_design):
+    terms = source_terms(sensors_design)
+    for names, identifiers in (
         (("slow one", "2nd", "m*/"), ["WAVEFRONT", "SLOW_ONE", "2ND", "M"]),
         (("m-1", "m_1", "ä"), ["WAVEFRONT_0", "M_1_1", "M_1_2", "3"]),
         (("x" * 30, "int", "\\\n*/"), ["WAVEFRONT_0", "X" * 24 + "_1", "INT_2", "3"]),
-    ],
-)
-def test_names_of_sensors_that_are_no_identifiers(sensors_design, names, found):
-    terms = source_terms(sensors_design)
-    rows = dict(zip(("wavefront", *names), terms.rows.values(), strict=True))
-    units = c_export._describe_units(replace(terms, rows=rows))
-    assert [unit["identifier"] for unit in units] == found
-    assert all(unit["name"].isascii() and "*/" not in unit["name"] for unit in units)
+    ):
+        rows = dict(zip(("wavefront", *names), terms.rows.values(), strict=True))
+        units = c_export._describe_units(replace(terms, rows=rows))
+        assert [unit["identifier"] for unit in units] == identifiers
+        assert all(unit["name"].isascii() and "*/" not in unit["name"] for unit in units)
 
 
-@pytest.mark.usefixtures("short_rehearsal")
-def test_a_table_that_is_too_long_is_refused(tmp_path, sensors_design, monkeypatch):
-    terms = source_terms(sensors_design)
-    count = sum(np.count_nonzero(gains.any(axis=1)) for gains in terms.gains.values())
-    count *= sensors_design.problem.n_states
-    monkeypatch.setattr(c_export, "MOST_GAINS", count)
-    lbt.interop.export(tmp_path / "k.c", sensors_design, "c")
-    monkeypatch.setattr(c_export, "MOST_GAINS", count - 1)
-    with pytest.raises(ProblemError, match=rf"got {count:,}, in a period of 2 frames"):
-        lbt.interop.export(tmp_path / "long.c", sensors_design, "c")
-
-
-@pytest.mark.usefixtures("short_rehearsal")
-def test_commands_that_are_off_are_refused(tmp_path, sensors_design, monkeypatch):
-    monkeypatch.setattr(pipeline, "LOSS", 1e-9)  # single precision is off by more
-    with pytest.raises(NumericalError, match=r"in a rehearsal.*Try double precision"):
-        lbt.interop.export(tmp_path / "single.c", sensors_design, "c", precision="single")
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("target", sorted({*target_names()} - {"c"}))
-def test_other_targets_refuse_it(tmp_path, sensors_design, target):
-    own = target_named(target)
-    with pytest.raises(ProblemError, match="this design reads slow, m1, m2 beside"):
-        lbt.interop.export(own.path_in(tmp_path), sensors_design, target)
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_certificate_beside_the_source(sensor_files):
-    for precision, exported in sensor_files.items():
-        beside = json.loads(exported.files[2].read_text())
-        assert (beside["form"], beside["precision"]) == ("estimator", precision)
-        assert (beside["period"], beside["sensors"]) == (2, list(UNITS))
+def test_the_certificate_and_the_cost_are_those_of_the_source(sensor_files, sensors_design):
+    for precision, written in sensor_files.items():
+        beside = json.loads(written.files[2].read_text())
+        facts = {"form": "estimator", "precision": precision, "period": 2, "sensors": [*UNITS]}
+        assert beside.items() >= facts.items()
         assert [check["passed"] for check in beside["checks"]] == [True] * 6
-        assert beside["checks"][-1]["value"] == exported.error
+        assert beside["checks"][-1]["value"] == written.error
     assert sensor_files["double"].error < 1e-11 < sensor_files["single"].error < 1e-3
-
-
-def test_the_cost_is_that_of_the_source(sensor_files, sensors_design):
-    """Products and sums of a frame in which all is read, counted in the text."""
-    text = sensor_files["double"].files[0].read_text().split("int double_step")[1]
-    written, cost = (
-        "".join(re.findall(r"=\n([^;]*);", text)),
-        frame_cost(source_terms(sensors_design)),
-    )
-    gains = 6 * int(re.search(r"add\(state->x, (\d+), gains", text)[1])
-    assert cost.multiplications == written.count(" * ") + gains
-    assert cost.additions == written.count(" + ") + written.count(" - ") + gains
+    source, cost = sensor_files["double"].files[0], frame_cost(source_terms(sensors_design))
+    gains = 6 * int(re.search(r"add\(state->x, (\d+), gains", source.read_text())[1])
+    assert [cost.multiplications, cost.additions] == (operations(source) + gains).tolist()
 
 
 @pytest.mark.parametrize("precision", LIMITS)
 def test_a_predictor_without_a_channel_is_its_fall_back(tmp_path, precision):
-    """In the loop of its own commands, beside the controllers of the design."""
-    predictor = made()
+    """It holds without its own sensor, or where that or the applied commands are not finite."""
+    predictor, truth = made(), lbt.Truth(turbulence=None, noise_nm=1.0)
     written = lbt.interop.export(tmp_path / "p.c", predictor, "c", precision=precision)
-    theirs = Compiled(written.files[0], single=precision == "single")
-    twin, ours = written.start(np.inf), predictor.controller.start(predictor.controllers)
-    rng, commands = np.random.default_rng(0), np.zeros((2, 2, 2))  # of both loops
-    expected, found = [], []
-    for k in range(300):
-        y = rng.standard_normal(5)
-        fresh = np.array([True, not 50 <= k < 90, not 80 <= k < 120, k != 200])
-        ours.miss([unit for unit, read in zip("abc", fresh[1:], strict=True) if not read])
-        seen = [np.append(y[:2] - past[1], y[2:]) for past in commands]
-        expected.append(ours.step(seen[0]))
-        last = theirs.u.astype(float)
-        blind = np.where(np.repeat(fresh, [2, 1, 1, 1]), seen[1], np.nan)
-        found.append(theirs.step(blind, fresh, last))
-        new = dict(zip(("wavefront", *"abc"), fresh.tolist(), strict=True))
-        assert np.array_equal(found[-1], twin.step(blind, new, last))
-        assert theirs.status == (MISSING if not fresh.all() else 0)
-        commands = np.stack([np.stack([expected[-1], found[-1]]), commands[:, 0]], axis=1)
-    assert relative(found, expected) < LIMITS[precision]
-    names = [check.name for check in written.checks]
-    assert "residual with any sensors missing, loss" in names
-    before, state = theirs.u.copy(), theirs.state.copy()
+    assert "residual with any sensors missing, loss" in [check.name for check in written.checks]
+    spans = {"a": (0.1, 0.18), "b": (0.16, 0.24), "c": (0.4, 0.402)}
+    drops = [Drop(unit=unit, start_s=start, end_s=end) for unit, (start, end) in spans.items()]
+    limit, single = LIMITS[precision], precision == "single"
+    compiled = require_commands(predictor, truth, drops, written, limit, single=single)
+    before, state = compiled.u.copy(), compiled.state.copy()
     for y, fresh, applied in (
         (np.ones(5), [0, 1, 1, 1], np.zeros(2)),
         ([np.nan, *np.ones(4)], [1, 1, 1, 1], np.zeros(2)),
         (np.ones(5), [1, 1, 1, 1], [0.0, np.inf]),
     ):
-        assert np.array_equal(theirs.step(y, fresh, applied), before)
-        assert theirs.status == HELD
-        assert np.array_equal(theirs.state, state)
+        assert np.array_equal(compiled.step(y, fresh, applied), before)
+        assert compiled.status == HELD
+        assert np.array_equal(compiled.state, state)
 
 
 CPP = """
@@ -477,7 +379,7 @@ int main() {{ {1}_state s; float y[{2}_MEASUREMENTS] = {{0}}, u[{2}_COMMANDS] = 
 def test_the_headers_are_fit_for_cpp(tmp_path, exported, sensor_files):
     fresh = "unsigned char fresh[SINGLE_SENSORS] = {0}; fresh[SINGLE_SENSOR_M1] = 1;\n"
     for source, more, inputs in (
-        (exported("kalman", "single").files[0], "", ""),
+        (exported("kalman", precision="single").files[0], "", ""),
         (sensor_files["single"].files[0], fresh, "fresh, u, "),
     ):
         name, user = source.stem, tmp_path / f"{source.stem}.cpp"

@@ -2,30 +2,23 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from math import comb
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.exports import relative
+from scipy.linalg import block_diag
+from scipy.signal import lfilter
+from support.exports import DifferenceEquation
+from support.lqg import slow_plant
 from support.recorded_runs import recorded_run
+from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.dao import export as dao
-from lbt_synth.interop.dao.export import (
-    ROUNDING,
-    InnerLoop,
-    _as_computed,
-    _widened,
-    direct_form,
-    direct_form_rows,
-    make_again,
-    mode_loop,
-    mode_polynomials,
-    round_together,
-)
 from lbt_synth.interop.proof import _rounding_left, prove_written
 from lbt_synth.linear.norms import band_norm
 from lbt_synth.loop.disturbances import draw_disturbance
@@ -44,57 +37,40 @@ def test_the_matrix_holds_the_controller(tmp_path, designs, name):
     assert (matrix.dtype, matrix.shape) == (np.float32, (41, 5))
     assert matrix.flags.c_contiguous
     assert not matrix[:, 2:].any()
-    frequency = np.linspace(1, 399, 100)
-    z = np.exp(2j * np.pi * frequency * design.controller.dt_s)
-    powers = z[:, None] ** -np.arange(21)
-    expected = design.controller.to_statespace().frequency_response(frequency)
-    rounding = np.finfo(np.float32).eps / 2
-    for mode in range(2):
-        exact = expected[:, mode, mode]
-        bottom = 1 - powers[:, 1:] @ matrix[21:, mode].astype(float)
-        found = (powers @ matrix[:21, mode].astype(float)) / bottom
-        sums = [np.sum(np.abs(part)) for part in (matrix[:21, mode], matrix[21:, mode])]
-        allowed = rounding * (sums[0] + np.abs(exact) * sums[1]) / np.abs(bottom)
-        assert np.all(np.abs(found - exact) <= 1.001 * allowed + 1e-12 * np.abs(exact))
-        assert relative(found, exact) < 1e-3  # so little of the whole
     assert written.error < 1e-4
+    rows = dao.direct_form_rows(design.controller, 20)
+    assert np.array_equal(matrix[:, :2], rows.astype(np.float32))
 
 
-def test_a_design_that_single_precision_breaks_is_refused_with_the_number(tmp_path, loaded):
-    lines = lbt.models.spread_plant(loaded.plant, half_width_hz=1.0, lines=3)
-    with pytest.raises(lbt.errors.NumericalError, match="spectral radius at sensor gains") as seen:
-        lbt.interop.export(tmp_path / "k.npy", lbt.kalman(lines), "dao")
-    assert seen.value.residual > 1
-    assert not list(tmp_path.iterdir())
+def written_radius(matrix, low, high):
+    """Largest spectral radius of the loop of two frames, from the polynomial of the numbers."""
+    b, a = np.split(matrix[:, 0].astype(float), [len(matrix) // 2 + 1])
+    gains = np.geomspace(low, high, 400)
+    polynomials = [np.r_[1.0, -a, 0.0, 0.0] + np.r_[0.0, 0.0, gain * b] for gain in gains]
+    return max(np.max(np.abs(np.roots(polynomial))) for polynomial in polynomials)
 
 
-@pytest.fixture(scope="module")
-def shaped_run(shaped):
-    """Disturbance, noise, and what the shaped design leaves of them."""
+def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, shaped):
+    """In the arithmetic of the computer the loop leaves what the design leaves in double."""
+    written = lbt.interop.export(tmp_path / "k.npy", shaped, "dao", order=20)
+    matrix = np.load(written.files[0])
+    assert matrix.shape == (41, 1)
+    assert written_radius(matrix, 0.5, 1.2) < 1
+    beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
+    assert written.notes[0].startswith("made again for single precision")
+    assert beside["notes"] == list(written.notes)
     air, line, *_ = shaped.specifications[0].terms
     vibration = lbt.models.SinusoidalVibration(
         frequency_hz=20.0, rms_nm=line.rms_nm, direction=(1.0,)
     )
     truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, vibrations=[vibration])
     drawn = draw_disturbance(truth, shaped.hardware, frames=6000, seed=1)
-    total, noise = drawn.phase_nm, drawn.noise
-    own = recorded_run(shaped.controller.start(), shaped.hardware, total, noise)
-    return total, noise, own[0, 1000:, 0]
-
-
-def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, shaped, shaped_run):
-    """In the arithmetic of the computer the loop leaves what the design leaves in double."""
-    written = lbt.interop.export(tmp_path / "k.npy", shaped, "dao", order=20)
-    matrix = np.load(written.files[0])
-    assert matrix.shape == (41, 1)
-    assert max(written_radius(matrix, gain) for gain in np.geomspace(0.5, 1.2, 40)) < 1
-    beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
-    assert written.notes[0].startswith("made again for single precision")
-    assert beside["notes"] == list(written.notes)
-    total, noise, own = shaped_run
-    found = recorded_run(InnerLoop(matrix), shaped.hardware, total, noise)[0, 1000:, 0]
-    assert np.std(found) == pytest.approx(np.std(own), rel=0.03)
-    assert np.std(found) < 0.3 * np.std(total)
+    exact, single = (
+        np.std(recorded_run(run, shaped.hardware, drawn.phase_nm, drawn.noise)[0, 1000:, 0])
+        for run in (shaped.controller.start(), dao.InnerLoop(matrix))
+    )
+    assert single == pytest.approx(exact, rel=0.03)
+    assert single < 0.3 * np.std(drawn.phase_nm)
 
 
 def test_a_sensor_gain_is_in_what_is_made_again(shaped):
@@ -102,12 +78,12 @@ def test_a_sensor_gain_is_in_what_is_made_again(shaped):
     half = replace(shaped.hardware, sensor_matrix=np.array([[0.5]]))
     (spec,) = shaped.specifications
     design = lbt.design.shape(half, spec, functions=12, states=None)
-    exact = direct_form_rows(design.controller, 20)
-    plain = make_again(shaped, direct_form_rows(shaped.controller, 20))
-    made = make_again(design, exact)
+    plain, made = (
+        dao.make_again(one, dao.direct_form_rows(one.controller, 20)) for one in (shaped, design)
+    )
     # to what the programmes leave open, and what makes up for the rounding of other coefficients
     assert made[:21] == pytest.approx(2 * plain[:21], rel=2e-3, abs=2e-6)
-    assert all(check.passed for check in prove_written(design, _as_computed(design, made)))
+    assert all(check.passed for check in prove_written(design, dao._as_computed(design, made)))
 
 
 @pytest.mark.study
@@ -118,66 +94,62 @@ def test_the_robust_example_runs_in_single_precision(tmp_path):
     losses = [check.value for check in written.checks if "residual" in check.name]
     assert len(losses) == 4
     assert max(losses) < 0.01
-    matrix = np.load(written.files[0])
-    assert max(written_radius(matrix, gain) for gain in np.geomspace(0.25, 1.3, 400)) < 1
+    assert written_radius(np.load(written.files[0]), 0.25, 1.3) < 1
 
 
-def test_what_the_matrix_cannot_hold_is_refused(tmp_path, designs, loaded):
-    def refused(design, match, **options):
-        with pytest.raises(lbt.errors.ProblemError, match=match):
-            lbt.interop.export(tmp_path / "k.npy", design, "dao", **options)
+def test_what_the_matrix_cannot_hold_is_refused(tmp_path, config, designs):
+    """The order leaves out the states of the other mode, and a delay in both polynomials."""
+    turned = replace(config.hardware, sensor_matrix=[[1, 0.1], [0, 1]])
+    lines = lbt.models.spread_plant(config.plant, half_width_hz=1.0, lines=3)
+    slanted = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=500, direction=(0.6, 0.8))
+    direct = lbt.Controller(A=[[0.0]], B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[1.0, 0.0], [0.5, 1.0]])
+    wide = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0]], C=[[1.0]], D=[[0.0, 0.0]])
+    big = lbt.Controller(A=np.eye(2, k=1), B=[[0.0], [1e30]], C=[[1e30, 0.0]], D=[[0.0]])
+    with np.errstate(over="ignore"):
+        rows_of_big = dao.direct_form_rows(big, 2).astype(np.float32)
 
-    refused(designs["kalman"], "order must be at least 4", order=3)
-    refused(designs["kalman"], "modes must be at least 2", modes=1)
-    turned = replace(loaded.hardware, sensor_matrix=[[1, 0.1], [0, 1]])
-    refused(lbt.integrator(turned, gain=0.3), "sensor_matrix must be diagonal")
-    bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
-    refused(bare, "needs the design of a loop")
+    def write(design, **options):
+        return lambda: lbt.interop.export(tmp_path / "k.npy", design, "dao", **options)
 
-
-def written_radius(matrix, gain):
-    """Spectral radius of the loop of two frames, from the polynomial of the written numbers."""
-    order = len(matrix) // 2
-    own = np.concatenate([[1.0], -matrix[order + 1 :, 0].astype(float), [0.0, 0.0]])
-    own[2:] += gain * matrix[: order + 1, 0]
-    return np.max(np.abs(np.roots(own)))
-
-
-def difference_equation(rows, series):
-    """Commands of ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, word for word."""
-    order = len(rows) // 2
-    y, u = (np.zeros((len(series) + order, rows.shape[1])) for _ in range(2))
-    y[order:] = series
-    for k in range(order, len(y)):
-        u[k] = sum(rows[j] * y[k - j] for j in range(order + 1))
-        u[k] += sum(rows[order + i] * u[k - i] for i in range(1, order + 1))
-    return u[order:]
+    coupled = lbt.kalman(slow_plant(modes=2, vibrations=[slanted])).controller
+    words = "here measurement 2 moves command 1. Design with --method robust"
+    rows = [
+        (write(designs["kalman"], order=3), ProblemError, "order must be at least 4"),
+        (write(designs["kalman"], modes=1), ProblemError, "modes must be at least 2"),
+        (write(lbt.integrator(turned, gain=0.3)), ProblemError, "sensor_matrix must be diagonal"),
+        (partial(dao.mode_polynomials, coupled), ProblemError, words),
+        (partial(dao.mode_polynomials, direct), ProblemError, "here measurement 1 moves command 2"),
+        (partial(dao.mode_polynomials, wide), ProblemError, "got 1 commands and 2 measurements"),
+    ]
+    rows += [
+        (partial(dao.direct_form, np.array(beyond), 1.0), NumericalError, "beyond its range")
+        for beyond in (rows_of_big, [[np.inf], [0.0], [1.0]], [[np.nan], [0.0], [1.0]])
+    ]
+    require_refusals(rows)
+    error = refused(write(lbt.kalman(lines)), NumericalError, "spectral radius at sensor gains")
+    assert error.residual > 1
+    assert not list(tmp_path.iterdir())
 
 
 @given(seed=st.integers(0, 2**32 - 1), orders=st.lists(st.integers(1, 5), min_size=1, max_size=3))
 def test_modes_of_any_order(seed, orders):
     """Modes of different orders, some without feedthrough, some with states of no effect."""
     rng = np.random.default_rng(seed)
-    n, m = sum(orders), len(orders)
-    A, B, C, D = np.zeros((n, n)), np.zeros((n, m)), np.zeros((m, n)), np.zeros((m, m))
-    start = 0
-    for mode, order in enumerate(orders):
-        states = slice(start, start + order)
-        start += order
-        block = rng.standard_normal((order, order))
-        A[states, states] = block * (0.9 / np.max(np.abs(np.linalg.eigvals(block))))
-        B[states, mode] = rng.standard_normal(order) * rng.choice([0, 1])
-        C[mode, states] = rng.standard_normal(order)
-        D[mode, mode] = rng.standard_normal() * rng.choice([0, 1])
-    turn = rng.permutation(n)
+    blocks = []
+    for order in orders:
+        A = rng.standard_normal((order, order))
+        A *= 0.9 / np.max(np.abs(np.linalg.eigvals(A)))
+        B, C, D = (rng.standard_normal(shape) for shape in ((order, 1), (1, order), (1, 1)))
+        blocks.append((A, B * rng.choice([0, 1]), C, D * rng.choice([0, 1])))
+    A, B, C, D = (block_diag(*matrices) for matrices in zip(*blocks, strict=True))
+    turn = rng.permutation(len(A))
     controller = lbt.Controller(A=A[np.ix_(turn, turn)], B=B[turn], C=C[:, turn], D=D)
-    rows = direct_form_rows(controller, 6)
-    series = rng.standard_normal((100, m))
-    run, again = controller.start(), direct_form(rows, 1.0).start()
-    expected = np.array([run.step(y) for y in series])
-    size = 1e-9 * max(1.0, np.max(np.abs(expected)))
-    assert np.max(np.abs(difference_equation(rows, series) - expected)) < size
-    assert np.max(np.abs([again.step(y) for y in series] - expected)) < size
+    rows = dao.direct_form_rows(controller, 6)
+    series = rng.standard_normal((100, len(orders)))
+    runs = controller.start(), DifferenceEquation(rows), dao.direct_form(rows, 1.0).start()
+    expected, *others = ([run.step(y) for y in series] for run in runs)
+    limit = 1e-9 * max(1.0, np.max(np.abs(expected)))
+    assert np.allclose(others, [expected] * 2, rtol=0, atol=limit)
 
 
 def test_coefficients_of_close_poles():
@@ -185,70 +157,10 @@ def test_coefficients_of_close_poles():
     r, n = 1 - 2.0**-10, 8
     A = r * np.eye(n) + np.eye(n, k=1)
     C, B = np.eye(n)[:1], np.eye(n)[:, -1:]
-    ((num, den),) = mode_polynomials(lbt.Controller(A=A, B=B, C=C, D=[[0.0]]))
+    ((num, den),) = dao.mode_polynomials(lbt.Controller(A=A, B=B, C=C, D=[[0.0]]))
     exact = [comb(n, k) * (-1) ** k * 1023**k / 1024**k for k in range(n + 1)]
     assert den == pytest.approx(exact, abs=BALANCE * max(exact))
     assert num == pytest.approx([0.0] * (n - 1) + [1.0, 0.0], abs=BALANCE * max(exact))
-
-
-def test_states_of_the_other_mode_and_delays_in_both_are_left_out(designs):
-    controller = designs["kalman"].controller
-    for num, den in mode_polynomials(controller):
-        assert num.shape == den.shape == (5,)  # of ten states, five are the other mode's, one is z
-        own = np.linalg.eigvals(controller.A)
-        assert all(np.min(np.abs(own - pole)) < 1e-9 for pole in np.roots(den))
-
-
-def test_modes_that_do_not_decouple(loaded):
-    slanted = replace(loaded.plant.vibrations[0], direction=(0.6, 0.8))
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800,
-        turbulence=loaded.plant.turbulence,
-        vibrations=[slanted],
-        noise_nm=loaded.noise_nm,
-    )
-    with pytest.raises(
-        ProblemError, match="here measurement 2 moves command 1. Design with --method robust"
-    ):
-        mode_polynomials(lbt.kalman(plant).controller)
-    direct = lbt.Controller(A=[[0.0]], B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[1.0, 0.0], [0.5, 1.0]])
-    with pytest.raises(ProblemError, match="here measurement 1 moves command 2"):
-        mode_polynomials(direct)
-    wide = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0]], C=[[1.0]], D=[[0.0, 0.0]])
-    with pytest.raises(ProblemError, match="got 1 commands and 2 measurements"):
-        mode_polynomials(wide)
-
-
-def test_coefficients_beyond_the_range_are_refused():
-    big = lbt.Controller(A=np.eye(2, k=1), B=[[0.0], [1e30]], C=[[1e30, 0.0]], D=[[0.0]])
-    with np.errstate(over="ignore"):
-        rows = direct_form_rows(big, 2).astype(np.float32)
-    for beyond in (rows, [[np.inf], [0.0], [1.0]], [[np.nan], [0.0], [1.0]]):
-        with pytest.raises(NumericalError, match="beyond its range"):
-            direct_form(np.array(beyond), 1.0)
-
-
-def number_by_number(matrix, series, limit):
-    """Commands of the loop as its source is read, each operation rounded to single precision."""
-    rows, modes = matrix.shape
-    order = rows // 2
-    memory = [[np.float32(0)] * rows for _ in range(modes)]
-    out = []
-    for y in series:
-        u = np.zeros(modes, dtype=np.float32)
-        for mode in range(modes):
-            past = memory[mode]
-            past[: order + 1] = [np.float32(y[mode]), *past[:order]]
-            total = matrix[0, mode] * past[0]
-            for row in range(1, rows):
-                total = np.float32(total + np.float32(matrix[row, mode] * past[row]))
-            u[mode] = total
-        u = np.clip(u, -limit, limit)
-        for mode in range(modes):
-            past = memory[mode]
-            past[order + 1 :] = [u[mode], *past[order + 1 : -1]]
-        out.append(u)
-    return np.array(out)
 
 
 @pytest.mark.parametrize("limit", [np.float32(np.inf), np.float32(0.8)])
@@ -256,9 +168,8 @@ def test_it_gives_the_commands_bit_for_bit(limit):
     rng = np.random.default_rng(1)
     matrix = (0.2 * rng.standard_normal((9, 3))).astype(np.float32)
     series = rng.standard_normal((200, 3)).astype(np.float32)
-    loop = InnerLoop(matrix, limit=limit)
-    found = np.array([loop.step(y) for y in series])
-    expected = number_by_number(matrix, series, limit)
+    loop, equation = dao.InnerLoop(matrix, limit=limit), DifferenceEquation(matrix, limit)
+    found, expected = (np.array([run.step(y) for y in series]) for run in (loop, equation))
     assert np.array_equal(found, expected)
     assert np.any(np.abs(expected) > 0.9) != np.isfinite(limit)
     loop.reset()
@@ -267,8 +178,8 @@ def test_it_gives_the_commands_bit_for_bit(limit):
 
 @pytest.fixture(scope="module")
 def case(shaped):
-    rows = direct_form_rows(shaped.controller, 20)[:, 0]
-    return mode_loop(shaped.hardware, shaped.specifications[0], 20), rows
+    rows = dao.direct_form_rows(shaped.controller, 20)[:, 0]
+    return dao.mode_loop(shaped.hardware, shaped.specifications[0], 20), rows
 
 
 def rounding_nm(loop, c):
@@ -276,83 +187,58 @@ def rounding_nm(loop, c):
     return np.sqrt(loop.residuals_nm(c, rounding=True) ** 2 - loop.residuals_nm(c) ** 2)
 
 
-def test_residuals_are_those_of_the_design(case, shaped):
+def test_residuals_and_radius_are_those_of_the_design(case, shaped):
     loop, c = case
-    (specification,) = shaped.specifications
+    air, line, *_ = shaped.specifications[0].terms
     expected = []
     for gain in loop.gains:
         around = lbt.close_loop(shaped.hardware, shaped.controller, sensor_gain=gain)
-        air, line, *_ = specification.terms
         truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, sensor_gain=gain)
         budget = lbt.residual_budget(around, truth, frame_means=True)
         peak = band_norm(around.path("phase", "residual"), line.low_hz, line.high_hz).upper
         expected.append(np.hypot(budget.rms_nm, line.rms_nm * peak))
-    assert loop.gains == (1.0, 0.6)
+    assert (*loop.gains, loop.low, loop.high) == (1.0, 0.6, 0.5, 1.2)
     assert loop.residuals_nm(c) == pytest.approx(expected, rel=2e-3)
-
-
-def test_radius_is_that_of_the_loop(case, shaped):
-    loop, c = case
     gains = np.append(np.geomspace(0.5, 1.2, 25), 1.0)
-    expected = np.max(affine_radii(parts_by_gain(shaped.hardware, shaped.controller), gains))
-    assert loop.radius(c) == pytest.approx(expected, rel=1e-6)
-    assert (loop.low, loop.high) == (0.5, 1.2)
+    radius = np.max(affine_radii(parts_by_gain(shaped.hardware, shaped.controller), gains))
+    assert loop.radius(c) == pytest.approx(radius, rel=1e-6)
 
 
 def test_sums_are_as_large_as_in_a_simulation(case):
     """White measurements into an FIR filter have known partial sums; the loop's are simulated."""
     loop, c = case
-    rng = np.random.default_rng(2)
-    b, a = c[:21], c[21:]
-    frames = 40_000
-    air = np.zeros(frames)
-    for k in range(1, frames):
-        air[k] = 0.99 * air[k - 1] + 40 * rng.standard_normal()
+    rng, frames = np.random.default_rng(2), 40_000
+    air = lfilter([40.0], [1.0, -0.99], rng.standard_normal(frames))
     line = np.sqrt(2) * 100 * np.cos(2 * np.pi * 20 / 800 * np.arange(frames))
-    y, u = np.zeros((2, frames + 21))
-    squares = np.zeros(2)
-    residual = 0.0
-    for k in range(frames):
-        y[k + 20] = residual + 20 * rng.standard_normal()
-        terms = np.concatenate([b * y[k : k + 21][::-1], a * u[k : k + 20][::-1]])
-        u[k + 20] = terms.sum()
-        residual = air[k] + line[k] - u[k + 19]
-        squares += np.sum(terms**2), np.sum(np.cumsum(terms)[1:] ** 2)
-    expected = ROUNDING * squares.sum() / frames
+    equation, u, residual, squares = DifferenceEquation(c[:, None]), np.zeros(1), 0.0, 0.0
+    for phase, noise in zip(air + line, 20 * rng.standard_normal(frames), strict=True):
+        last, u = u, equation.step(residual + noise)
+        residual = phase - last
+        squares += np.sum(equation.terms**2) + np.sum(np.cumsum(equation.terms)[1:] ** 2)
+    expected = dao.ROUNDING * squares / frames
     assert loop.sums_nm2(c, loop.gains[0]) == pytest.approx(expected, rel=0.15)
 
 
-def test_rounding_in_the_loop_is_that_of_the_lyapunov_equation(case, shaped):
-    """Noise that enters with the command, through the state-space loop.
-
-    A factor common to both polynomials keeps the state-space loop well conditioned.
-    """
-    loop, own = case
-    c = _widened(own)
-    added = np.concatenate([np.eye(21)[0], c[21:]])
-    written, entry = (direct_form(x[:, None], shaped.controller.dt_s) for x in (c, added))
-    variance = np.array([loop.sums_nm2(c, 1.0)])
-    left = _rounding_left(shaped.hardware, written, entry, variance, 1.0)
-    assert rounding_nm(loop, c)[0] == pytest.approx(np.sqrt(left[0]), rel=2e-3)
-
-
-def test_sections_give_back_the_coefficients(case):
-    wide = _widened(case[1])
-    assert dao._coefficients(dao._sections(wide)) == pytest.approx(wide, abs=1e-9)
-
-
-def test_a_common_factor_leaves_the_loop_as_it_is(case):
+def test_a_common_factor_leaves_the_loop_and_takes_rounding_away(case, shaped):
+    """It keeps the state-space loop, through which noise enters with the command, well conditioned."""
     loop, c = case
-    wide = _widened(c)
+    wide = dao._widened(c)
     assert loop.residuals_nm(wide) == pytest.approx(loop.residuals_nm(c), rel=1e-6)
-    assert rounding_nm(loop, wide)[0] < 0.2 * rounding_nm(loop, c)[0]
+    assert dao._coefficients(dao._sections(wide)) == pytest.approx(wide, abs=1e-9)
+    before, after = rounding_nm(loop, c)[0], rounding_nm(loop, wide)[0]
+    assert after < 0.2 * before
+    added = np.concatenate([np.eye(21)[0], wide[21:]])
+    written, entry = (dao.direct_form(x[:, None], shaped.controller.dt_s) for x in (wide, added))
+    variance = np.array([loop.sums_nm2(wide, 1.0)])
+    rounding_nm2 = _rounding_left(shaped.hardware, written, entry, variance, 1.0)
+    assert after == pytest.approx(np.sqrt(rounding_nm2[0]), rel=2e-3)
 
 
 def test_slopes_are_those_of_finite_differences(case):
     """Without the rounding, whose memory counts as constant."""
     loop, c = case
     loop = replace(loop, shares=np.zeros_like(loop.shares))
-    theta = dao._sections(_widened(c))
+    theta = dao._sections(dao._widened(c))
     shares = 1 / loop.residuals_nm(c)
     limits = dao._limits(loop, c)
     before, slopes = dao._rows(loop, shares, limits, theta)
@@ -371,11 +257,11 @@ def test_slopes_are_those_of_finite_differences(case):
 def test_errors_of_rounding_cancel_where_they_count(case):
     """Against rounding one by one, by what each changes of the loop's polynomial."""
     loop, own = case
-    c = _widened(own)
-    rounded = round_together(loop, c)
+    c = dao._widened(own)
+    rounded = dao.round_together(loop, c)
     assert rounded.dtype == np.float32
     assert np.any(own == 0)
-    assert np.all(round_together(loop, own)[own == 0] == 0)
+    assert np.all(dao.round_together(loop, own)[own == 0] == 0)
 
     def change(near):
         gains = (1.0, loop.low, loop.high, *loop.gains)

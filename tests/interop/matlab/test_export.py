@@ -1,9 +1,9 @@
-"""MATLAB files, read back and stepped."""
+"""MATLAB files, read back; test_pipeline steps them."""
 
 import numpy as np
 import pytest
 from scipy.io import loadmat
-from support.exports import bare_design, relative
+from support.exports import bare_design
 
 import lbt_synth as lbt
 
@@ -16,25 +16,14 @@ def test_matlab_round_trip(tmp_path, designs, name):
     data = loadmat(written.files[0], simplify_cells=True)
     for key in "ABCD":
         assert np.array_equal(data["new_state"][key], getattr(design.controller, key))
-    form = data["textbook"]
-    A, B, C, D = (getattr(design.controller, key) for key in "ABCD")
-    assert np.array_equal(form["C"], C @ A)
-    assert np.array_equal(form["D"], C @ B + D)
+    form, (A, B, C, D) = data["textbook"], (getattr(design.controller, key) for key in "ABCD")
+    expected = {"A": A, "B": B, "C": C @ A, "D": C @ B + D}
+    assert all(np.array_equal(form[key], matrix) for key, matrix in expected.items())
     assert data["dt_s"] == design.controller.dt_s
     assert (data["frame_rate_hz"], data["delay_frames"]) == (800, 2)
     assert "ss(textbook.A, textbook.B, textbook.C, textbook.D, dt_s)" in data["convention"]
     assert "cd" * 32 in data["provenance"]
     assert written.error < 1e-13
-    assert all(check.passed for check in written.checks)
-    assert len(written.checks) > 2
-    run, x = design.controller.start(), np.zeros(len(A))
-    series = np.random.default_rng(6).standard_normal((300, 2))
-    expected = np.array([run.step(y) for y in series])
-    found = []
-    for y in series:  # as ss(...) is stepped
-        found.append(form["C"] @ x + form["D"] @ y)
-        x = form["A"] @ x + form["B"] @ y
-    assert relative(found, expected) < 1e-12
 
 
 def test_matlab_file_of_a_bare_problem(tmp_path):

@@ -1,9 +1,11 @@
 """Modes, slopes and images of SPECULA's optics."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from support.refusals import require_refusals
 from support.small_telescope import SETUP, needs_specula
 
 import lbt_synth as lbt
@@ -51,23 +53,12 @@ def test_too_many_modes_for_the_mirror():
         make_modes(replace(SETUP, modes=40))
 
 
-@pytest.mark.parametrize(
-    ("change", "match"),
-    [
-        ({"diameter_m": 0}, "diameter_m"),
-        ({"pixels": 61}, "pixels must be even"),
-        ({"pixels": 20}, "pixels must be even"),
-        ({"pixels": 2000}, "pixels must be even"),
-        ({"hardware": lbt.LoopHardware(frame_rate_hz=800, modes=3)}, "two modes"),
-        (
-            {"hardware": lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=2 * np.eye(2))},
-            "sensor_matrix",
-        ),
-    ],
-)
-def test_systems_that_are_refused(setup, change, match):
-    with pytest.raises(ProblemError, match=match):
-        replace(setup, **change)
+def test_systems_that_are_refused(setup):
+    path = partial(lbt.LoopHardware, frame_rate_hz=800)
+    changes = [({"pixels": pixels}, "pixels must be even") for pixels in (61, 20, 2000)]
+    changes += [({"diameter_m": 0}, "diameter_m"), ({"hardware": path(modes=3)}, "two modes")]
+    changes += [({"hardware": path(sensor_matrix=2 * np.eye(2))}, "sensor_matrix")]
+    require_refusals([(partial(replace, setup, **c), ProblemError, words) for c, words in changes])
 
 
 def test_a_phase_screen_is_longer_than_the_way_of_the_wind(setup):
