@@ -15,10 +15,7 @@ FORBIDDEN = {
     "design/new_method.py": ("cvxpy", "Only linear.lmi imports cvxpy"),
     "interop/new_program.py": ("specula", "Only interop.specula.optics imports specula"),
     "files/telemetry/new_format.py": ("aotpy", "Only files.telemetry.aot imports aotpy"),
-    "files/telemetry/new_archive.py": (
-        "h5py",
-        "Only storage.array_file imports h5py",
-    ),
+    "files/telemetry/new_archive.py": ("h5py", "Only storage.array_file imports h5py"),
     "studies/study/new_pool.py": ("distributed", "Only storage.executors imports distributed"),
     "report/page/new_chart.py": ("bokeh", "Only report.explore imports bokeh"),
     "report/page/new_sheet.py": ("weasyprint", "Only report.page.html imports weasyprint"),
@@ -30,31 +27,17 @@ FORBIDDEN = {
     "linear/new_plant.py": ("lbt_synth.models", "Rooms import only downwards"),
 }
 
-CONTRACTS = {
-    contract["name"]
-    for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
-        "contracts"
-    ]
-}
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CONTRACTS = {contract["name"] for contract in PROJECT["tool"]["importlinter"]["contracts"]}
 
 
 def broken_contracts(folder):
     """Exit status, names of the contracts that a copy of the package breaks, and the text."""
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "from importlinter.cli import lint_imports_command; lint_imports_command()",
-            "--config",
-            str(ROOT / "pyproject.toml"),
-            "--no-cache",
-        ],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    code = "from importlinter.cli import lint_imports_command; lint_imports_command()"
+    command = [sys.executable, "-c", code, "--config", str(ROOT / "pyproject.toml"), "--no-cache"]
+    environment = {**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"}
+    options = {"env": environment, "capture_output": True, "text": True}
+    done = subprocess.run(command, cwd=folder, check=False, **options)
     said = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout)  # older versions colour what is no terminal
     broken = set(re.findall(r"^(.*) BROKEN\b", said, re.MULTILINE))
     return done.returncode, broken, said
@@ -62,10 +45,8 @@ def broken_contracts(folder):
 
 @pytest.fixture
 def package(tmp_path):
-    shutil.copytree(
-        ROOT / "lbt_synth", tmp_path / "lbt_synth", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    return tmp_path / "lbt_synth"
+    ignored = shutil.ignore_patterns("__pycache__")
+    return shutil.copytree(ROOT / "lbt_synth", tmp_path / "lbt_synth", ignore=ignored)
 
 
 def test_each_contract_holds_for_a_module_that_is_not_yet_written(package):

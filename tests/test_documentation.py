@@ -2,11 +2,12 @@
 
 import ast
 import importlib
-import importlib.util
 import inspect
 import re
+import runpy
 import shutil
 import tomllib
+from types import SimpleNamespace
 
 import pytest
 from ruamel.yaml import YAML
@@ -14,11 +15,8 @@ from support.plants import ROOT
 
 import lbt_synth as lbt
 
-PAGES = sorted(
-    path
-    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
-    if "generated" not in path.parts and "_build" not in path.parts
-)
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/**/*.md")]
+PAGES = sorted(path for path in PAGES if {"generated", "_build"}.isdisjoint(path.parts))
 NOTES = [ROOT / "CHANGELOG.md", *ROOT.glob("examples/**/*.md"), *ROOT.glob("tests/**/*.md")]
 TESTS = {
     name
@@ -26,9 +24,7 @@ TESTS = {
     for name in re.findall(r"^def (test_\w+)\(", path.read_text(encoding="utf-8"), re.MULTILINE)
 }
 ADDRESS = re.compile(r"\s*(?:[-*] )?(?:!?\[[^\]]*\]\(\S+\)|\S{90,})[.,;:]?")
-NOT_ENGLISH = re.compile(
-    r"\b(?:anew|told|answers? to a step|one a (?:mode|frame))\b", re.IGNORECASE
-)
+NOT_ENGLISH = re.compile(r"(?i)\b(?:anew|told|answers? to a step|one a (?:mode|frame))\b")
 
 
 def prose(text):
@@ -43,16 +39,11 @@ def prose(text):
 
 @pytest.mark.parametrize("page", [*PAGES, *NOTES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_prose_is_plain_and_no_line_is_longer_than_100(page):
-    lines = prose(page.read_text(encoding="utf-8"))
+    text = page.read_text(encoding="utf-8")
+    lines = prose(text)
+    assert len(text.splitlines()) <= 120 or "decisions" not in page.parts  # what holds today
     assert [line for line in lines if len(line) > 100] == []
     assert NOT_ENGLISH.findall(" ".join(lines)) == []
-
-
-@pytest.mark.parametrize(
-    "page", sorted(ROOT.glob("docs/decisions/*.md")), ids=lambda page: page.stem
-)
-def test_a_page_of_decisions_says_what_holds_today_in_120_lines(page):
-    assert len(page.read_text(encoding="utf-8").splitlines()) <= 120
 
 
 def test_the_citation_is_of_this_version_and_goes_into_the_source_archive():
@@ -64,18 +55,14 @@ def test_the_citation_is_of_this_version_and_goes_into_the_source_archive():
 
 @pytest.fixture(scope="module")
 def house():
-    spec = importlib.util.spec_from_file_location("house", ROOT / "docs" / "house.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(ROOT / "docs" / "house.py"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_files_and_tests_that_a_page_cites_are_there(page):
     text = page.read_text(encoding="utf-8")
-    cited = re.findall(
-        r"\b(?:tests|benchmarks|docs|examples|lbt_synth)/[\w/]+\.(?:py|md|yaml|png)\b", text
-    )
+    folders = "tests|benchmarks|docs|examples|lbt_synth"
+    cited = re.findall(rf"\b(?:{folders})/[\w/]+\.(?:py|md|yaml|png)\b", text)
     assert [path for path in cited if not (ROOT / path).exists()] == []
     assert set(re.findall(r"`(test_\w+)`", text)) <= TESTS
 
@@ -92,10 +79,9 @@ def test_every_module_has_a_sentence_and_every_room_a_table(house):
 
 @pytest.mark.parametrize("text", ["", '"""TODO"""\n', '"""No full stop"""\n', "import os\n"])
 def test_a_module_without_a_sentence_fails_the_build(house, tmp_path, text):
-    (tmp_path / "lbt_synth").mkdir()
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     for room in house.rooms():
-        (tmp_path / "lbt_synth" / room).mkdir()
+        (tmp_path / "lbt_synth" / room).mkdir(parents=True)
         (tmp_path / "lbt_synth" / room / "__init__.py").write_text('"""A room for a test."""\n')
     assert "### linear" in house.architecture(tmp_path)
     (tmp_path / "lbt_synth" / "linear" / "new.py").write_text(text)
@@ -104,12 +90,11 @@ def test_a_module_without_a_sentence_fails_the_build(house, tmp_path, text):
 
 
 def test_the_reference_has_the_names_of_the_stubs(house):
-    pages = house.reference()
-    index = (ROOT / "docs" / "api" / "index.md").read_text()
+    pages, index = house.reference(), (ROOT / "docs" / "api" / "index.md").read_text()
     rooms = re.findall(r"^rooms/(\w+)$", index, re.MULTILINE)
     assert set(rooms) == {room.replace(".", "_") for room in pages}
-    assert "\n   solve_dare\n" in pages["linear"]
-    assert "\n   InfeasibleError\n" in pages["errors"]
+    for room, name in (("linear", "solve_dare"), ("errors", "InfeasibleError")):
+        assert f"\n   {name}\n" in pages[room]
 
 
 SCRIPTS = sorted([*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/**/*.py")])
@@ -134,7 +119,5 @@ def test_names_that_a_script_uses_are_there(script):
                     importlib.import_module(f"{node.module}.{alias.name}")
         elif path := module_path(node):
             thing = lbt
-            for name in path:
-                thing = getattr(thing, name)
-                if not inspect.ismodule(thing):
-                    break
+            while path and inspect.ismodule(thing):
+                thing = getattr(thing, path.pop(0))

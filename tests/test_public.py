@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 from support.plants import ROOT
+from support.refusals import refused
 
 import lbt_synth as lbt
 
-_FOLDERS = (
-    stub.parent.relative_to(ROOT / "lbt_synth") for stub in ROOT.glob("lbt_synth/*/**/*.pyi")
-)
+_STUBS = ROOT.glob("lbt_synth/*/**/*.pyi")
+_FOLDERS = (stub.parent.relative_to(ROOT / "lbt_synth") for stub in _STUBS)
 ROOMS = sorted({"errors", *(".".join(folder.parts) for folder in _FOLDERS)})
 _PAGES = ["README.md", *sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md"))]
 
@@ -26,7 +26,6 @@ def room(path):
 
 
 def public_names(path):
-    """Names that a room shows, without its folders."""
     if path == "errors":
         return sorted(name for name in vars(room(path)) if name.endswith("Error"))
     return sorted(n for n in room(path).__all__ if not inspect.ismodule(getattr(room(path), n)))
@@ -50,13 +49,15 @@ def listed(stub):
     }
 
 
-def test_the_face_has_at_most_forty_four_names():
+def test_the_face_has_at_most_forty_four_names_and_no_other():
     assert len(FACE) <= 44
     assert listed(Path(lbt.__file__).with_suffix(".pyi")) == set(FACE)
     for name in FACE:
         thing = getattr(lbt, name)
         if not inspect.ismodule(thing):  # and is one that its room shows
             assert any(thing is public(other) for other in NAMES), name
+    refused(lambda: lbt.no_such_name, AttributeError, "no_such_name")
+    assert not hasattr(lbt, "__wrapped__")
 
 
 def test_help_is_a_page_with_every_name():
@@ -66,18 +67,11 @@ def test_help_is_a_page_with_every_name():
     assert [name for name in FACE if name not in words and name != "LbtSynthError"] == []
 
 
-def test_a_name_that_is_nowhere_is_refused():
-    with pytest.raises(AttributeError, match="no_such_name"):
-        _ = lbt.no_such_name
-    assert not hasattr(lbt, "__wrapped__")
-
-
 @pytest.mark.parametrize("path", [path for path in ROOMS if path != "errors"])
 def test_the_stub_of_a_room_lists_what_is_there(path):
     shown = room(path)
     assert listed(Path(shown.__file__).with_suffix(".pyi")) == set(shown.__all__)
-    for name in shown.__all__:
-        assert getattr(shown, name) is not None
+    assert all(getattr(shown, name) is not None for name in shown.__all__)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -98,19 +92,14 @@ def test_docstrings(name):
 @pytest.mark.parametrize("page", [p for p in _PAGES if ">>> " in (ROOT / p).read_text()])
 def test_examples_on_pages_run(page, monkeypatch):
     monkeypatch.chdir(ROOT)
-    results = doctest.testfile(
-        str(ROOT / page), module_relative=False, optionflags=doctest.ELLIPSIS
-    )
-    assert results.attempted > 0
-    assert results.failed == 0
+    page = str(ROOT / page)
+    results = doctest.testfile(page, module_relative=False, optionflags=doctest.ELLIPSIS)
+    assert (results.attempted > 0, results.failed) == (True, 0)
 
 
 @pytest.mark.parametrize("page", _PAGES)
 def test_no_figure_is_left_to_be_filled_in(page):
-    """``{{NAME}}``, and a line that is one word in capitals, stand for what is still to be measured.
-
-    LaTeX and JSON close braces, too.
-    """
+    """``{{NAME}}`` and a line that is one word in capitals are; LaTeX and JSON close braces, too."""
     text = (ROOT / page).read_text(encoding="utf-8")
     assert re.findall(r".*(?:\{\{|\b[A-Z][A-Z0-9_]*\}\}).*", text) == []
     assert re.findall(r"^[A-Z]{4,}$", text, re.MULTILINE) == []

@@ -14,14 +14,7 @@ def gains(lbt_designs, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def recorded_loop():
-    """A loop of two axes that ran with an integrator: its simulation, hardware and design."""
-    return simulated_night()
-
-
-@pytest.fixture(scope="session")
-def recorded_night(recorded_loop, tmp_path_factory):
-    """The telemetry of that loop."""
-    simulation, path, _ = recorded_loop
+def recorded_night(tmp_path_factory):
+    simulation, path, _ = simulated_night()
     seen = lbt.files.telemetry_from_simulation(simulation, path, sensor_gain=GAIN)
     return lbt.files.save_telemetry(tmp_path_factory.mktemp("night") / "night.fits", seen)

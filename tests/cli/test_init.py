@@ -25,7 +25,7 @@ def test_a_telescope_is_written_with_its_schema(here, capsys):
     assert json.loads((here / "lbt-synth.schema.json").read_text()) == config_schema()
 
 
-def test_nothing_is_replaced_without_force(here, capsys):
+def test_nothing_is_replaced_without_force_and_examples_keep_their_names(here, capsys):
     for _ in range(2):  # the same again replaces nothing
         run_done(capsys, "init")
     (here / "generic.yaml").write_text("mine")
@@ -35,9 +35,6 @@ def test_nothing_is_replaced_without_force(here, capsys):
     data = run_json(capsys, "init", "--force")
     assert data["files"] == ["generic.yaml", "lbt-synth.schema.json"]
     lbt.load_config("generic.yaml")
-
-
-def test_the_examples_are_written_under_their_names(here, capsys):
     run_done(capsys, "init", "--examples")
     assert {file.name for file in (here / "examples").iterdir()} == set(example_files())
     lbt.studies.load_study("examples/study.yaml")

@@ -17,23 +17,29 @@ NAMES = ("elt", "gemini", "generic", "keck", "lbt", "vlt")
 
 def test_the_example_is_the_papers_table_i(config):
     s = config.settings
-    pyramid = s.sensor.pyramid
-    assert (s.telescope.diameter_m, s.telescope.obstruction) == (8.22, 0.11)
-    assert (s.atmosphere.seeing_arcsec, s.atmosphere.outer_scale_m) == (0.8, 22)
-    assert s.atmosphere.wind_speed_m_s == 20
+    telescope, loop, pyramid = s.telescope, s.loop, s.sensor.pyramid
+    air = s.atmosphere
+    assert (telescope.diameter_m, telescope.obstruction, s.mirror.modes) == (8.22, 0.11, 672)
+    assert (air.seeing_arcsec, air.outer_scale_m, air.wind_speed_m_s) == (0.8, 22, 20)
     assert (pyramid.wavelength_um, pyramid.modulation_lambda_over_d) == (0.75, 4)
-    assert (pyramid.subapertures_across, pyramid.photons) == (30, 50)
-    assert pyramid.read_noise_electrons == 8
-    assert (s.mirror.modes, s.loop.frame_rate_hz, s.loop.delay_frames) == (672, 800, 2)
+    assert (pyramid.photons, pyramid.read_noise_electrons) == (50, 8)
+    assert (pyramid.subapertures_across, loop.frame_rate_hz, loop.delay_frames) == (30, 800, 2)
     assert config.noise_nm == pytest.approx(15.6, abs=0.1)
     assert config.plant.vibrations[0].rms_nm == pytest.approx(797, abs=0.1)
     assert config.plant.turbulence[0].coefficients[0] == pytest.approx(0.98860, abs=5e-6)
 
 
 UNSTABLE = {"kind": "ar", "coefficients": [1.2], "driving_rms_nm": 1.0}
-ONE_KEY = [  # what is set, or taken away, and what is said of it
-    ("telescope.diameter_mm", 8220, "did you mean diameter_m?"),
-    ("loop.frame_rate_khz", 0.8, "did you mean frame_rate_hz?"),
+
+
+def line_in(section, **keys):
+    kind = {"damping": 0.01} if section == "model" else {"kind": "sinusoid"}
+    return {section: {"vibrations": [{"frequency_hz": 20.0, **kind, **keys}]}}
+
+
+ONE_KEY = [  # what is set in the example, or taken away, and what is said of it
+    ("telescope.diameter_mm", 8220, "did you mean diameter_m"),
+    ("loop.frame_rate_khz", 0.8, "did you mean frame_rate_hz"),
     ("weather", {}, "known are"),
     ("loop.frame_rate_hz", ..., "is missing"),
     ("atmosphere", ..., "is missing"),
@@ -57,63 +63,20 @@ OTHER_KEY = [  # what is said of another key, or of none
     ("mirror.influence_matrix", [[0, 0], [0, 0]], "", "got only zeros"),
     ("model.turbulence", UNSTABLE, "model.turbulence.coefficients", "must be stationary"),
 ]
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "key", "text"), [*((p, v, p, t) for p, v, t in ONE_KEY), *OTHER_KEY]
-)
-def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
-    file = write_config(tmp_path, change_key(parse_path(path), value))
-    error = refused(lambda: lbt.load_config(file), ConfigError, re.escape(text))
-    assert error.path == key
-    assert key in str(error)
-    assert "\n" not in str(error)
-
-
-def test_other_texts_are_refused(tmp_path):
-    empty, odd = "must hold sections, each with its keys; got ", "not valid YAML"
-    for content, text in (
-        ("", empty + "nothing"),
-        ("- 1\n- 2\n", empty + "a list"),
-        ("a: [1, 2\n", odd),
-        ("version: 1\nversion: 1\n", "duplicate key"),
-        ("a: !!python/object:os.system x\n", odd),
-        ("\x00", odd),
-        ("a: " + "[" * 1000, odd),
-        ("# " + "x" * 2**17, "it is larger than 128 kB"),
-        ("version: 1\nsensor: &a [*a]\n", "sensor"),
-    ):
-        file = write_config(tmp_path, content)
-        message = str(refused(lambda: lbt.load_config(file), ConfigError, text))  # noqa: B023
-        assert "\n" not in message
-        assert len(message) < 300
-    for name, text in (("none.yaml", "No such file"), ("", "Is a directory")):
-        path = tmp_path / name
-        refused(lambda: lbt.load_config(path), ConfigError, f"cannot read .*{text}")  # noqa: B023
-    (tmp_path / "b.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="is not UTF-8 text: .* at byte"):
-        lbt.load_config(tmp_path / "b.yaml")
-
-
-def line_in(section, **keys):
-    """Return a section of a configuration with one vibration of 20 Hz."""
-    kind = {"damping": 0.01} if section == "model" else {"kind": "sinusoid"}
-    return {section: {"vibrations": [{"frequency_hz": 20.0, **kind, **keys}]}}
-
-
-MISSING = [
-    ({"sensor": {"noise_mas": 2.0}}, "telescope is missing: sensor.noise_mas is in mas"),
-    ({"sensor": {"pyramid": GOOD["sensor"]["pyramid"]}}, "the noise of sensor.pyramid"),
-    ({"model": {"turbulence": {"kind": "ar1"}}}, "model.turbulence of kind ar1"),
-    ({"model": {"turbulence": [AR, {"kind": "ar2"}]}}, r"model.turbulence\[1\] of kind ar2"),
-    (line_in("model", axis="tip", rms_mas=30.0), r"model.vibrations\[0\].rms_mas is in mas"),
-    (line_in("truth", axis="tip", rms_mas=30.0), r"truth.vibrations\[0\].rms_mas"),
-    ({"truth": {"turbulence": "frozen_flow"}}, "truth.turbulence: frozen_flow"),
-    ({"atmosphere": GOOD["atmosphere"]}, "telescope is missing: the turbulence"),
-]
+TELESCOPE, AIR = "telescope is missing: .*", "atmosphere is missing: .*"
 SECOND, ONE = "model.turbulence[1].coefficient", {"loop": {"axes": 1}}
 LEAVE_OUT = "one axis: leave axis and direction_deg out"
-MISFITS = [
+AR1, AR2, PYRAMID = {"kind": "ar1"}, {"kind": "ar2"}, {"pyramid": GOOD["sensor"]["pyramid"]}
+THREE = {"noise_nm": [1.0, 2.0, 3.0], "matrix": [[1, 0], [0, 1], [1, 1]]}
+SECTIONS = [  # of the smallest configuration
+    ({"sensor": {"noise_mas": 2.0}}, "telescope", f"{TELESCOPE}sensor.noise_mas is in mas"),
+    ({"sensor": PYRAMID}, "telescope", f"{TELESCOPE}the noise of sensor.pyramid"),
+    ({"model": {"turbulence": AR1}}, "atmosphere", f"{AIR}model.turbulence of kind ar1"),
+    ({"model": {"turbulence": [AR, AR2]}}, "atmosphere", rf"{AIR}.*\[1\] of kind ar2"),
+    (line_in("model", axis="tip", rms_mas=30.0), "telescope", rf"{TELESCOPE}model.*\[0\].rms_mas"),
+    (line_in("truth", axis="tip", rms_mas=30.0), "telescope", rf"{TELESCOPE}truth.*\[0\].rms_mas"),
+    ({"truth": {"turbulence": "frozen_flow"}}, "atmosphere", f"{AIR}truth.turbulence: frozen_flow"),
+    ({"atmosphere": GOOD["atmosphere"]}, "telescope", f"{TELESCOPE}the turbulence"),
     # lists of another length, or of other things
     ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one per measurement \(2\); got 1"),
     ({"sensor": {"noise_nm": [1.0, -1.0]}}, "sensor.noise_nm[1]", "greater than or equal to 0.001"),
@@ -122,14 +85,7 @@ MISFITS = [
     ({"model": {"turbulence": [AR, {**AR, "coefficient": 1}]}}, SECOND, "mean coefficients"),
     ({"model": {"sensor_gain": [1.0, 1.0, 1.0]}}, "model.sensor_gain", "got 3"),
     ({"truth": {"sensor_gain": [1.0, 0.9]}}, "truth.sensor_gain", "valid number"),
-    (
-        {
-            "sensor": {"noise_nm": [1.0, 2.0, 3.0], "matrix": [[1, 0], [0, 1], [1, 1]]},
-            "model": {"turbulence": {"kind": "ar2"}},
-        },
-        "model.turbulence",
-        "3 for 2 axes",
-    ),
+    ({"sensor": THREE, "model": {"turbulence": AR2}}, "model.turbulence", "3 for 2 axes"),
     # one axis
     ({"sensor": {"matrix": [[1, 0], [0, 1]]}, **ONE}, "sensor.matrix", "1 columns .*; got 2"),
     ({**line_in("model", axis="tilt", rms_nm=30.0), **ONE}, "model.vibrations[0]", LEAVE_OUT),
@@ -138,36 +94,58 @@ MISFITS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("sections", "key", "text"), [*((s, None, t) for s, t in MISSING), *MISFITS]
-)
-def test_what_is_missing_or_does_not_fit_is_said(tmp_path, sections, key, text):
+def smallest(sections):
     content = minimal_config(**sections)
     if {"noise_mas", "pyramid"} & content["sensor"].keys():
         del content["sensor"]["noise_nm"]
+    return content
+
+
+@pytest.mark.parametrize(
+    ("content", "key", "text"),
+    [
+        *((change_key(parse_path(path), value), path, text) for path, value, text in ONE_KEY),
+        *((change_key(parse_path(path), value), *said) for path, value, *said in OTHER_KEY),
+        *((smallest(sections), *said) for sections, *said in SECTIONS),
+    ],
+)
+def test_mistakes_are_refused_with_their_path(tmp_path, content, key, text):
     file = write_config(tmp_path, content)
     error = refused(lambda: lbt.load_config(file), ConfigError, text)
-    assert "c.yaml" in str(error)
-    if key is None:
-        assert f"{error.path} is missing: " in str(error)
-        assert error.path in ("telescope", "atmosphere")
-    else:
-        assert error.path == key
+    assert (error.path, "\n" in str(error)) == (key, False)
+    assert all(word in str(error) for word in (key, "c.yaml"))
 
 
-def test_the_smallest_file_of_the_documentation(tmp_path):
-    page = (ROOT / "docs" / "configuration.md").read_text()
-    path = write_config(tmp_path, page.split("```yaml\n")[1].split("```")[0])
-    assert lbt.load_config(path).design("kalman").certificate.passed
+def test_other_texts_are_refused(tmp_path):
+    empty, odd = "must hold sections, each with its keys; got ", "not valid YAML"
+    file = tmp_path / "c.yaml"
+    for content, text in (
+        (b"", empty + "nothing"),
+        (b"- 1\n- 2\n", empty + "a list"),
+        (b"a: [1, 2\n", odd),
+        (b"version: 1\nversion: 1\n", "duplicate key"),
+        (b"a: !!python/object:os.system x\n", odd),
+        (b"\x00", odd),
+        (b"a: " + b"[" * 1000, odd),
+        (b"# " + b"x" * 2**17, "it is larger than 128 kB"),
+        (b"version: 1\nsensor: &a [*a]\n", "sensor"),
+        (b"\xff\xfe\x00", "is not UTF-8 text: .* at byte"),
+    ):
+        file.write_bytes(content)
+        message = str(refused(lambda: lbt.load_config(file), ConfigError, text))
+        assert ("\n" in message, len(message) < 300) == (False, True)
+    file.unlink()
+    refused(lambda: lbt.load_config(file), ConfigError, "cannot read .*No such file")
 
 
-def test_templates_and_examples_come_with_the_package():
+def test_templates_and_examples_come_with_the_package(tmp_path):
     assert telescope_names() == list(NAMES)
-    with pytest.raises(ProblemError, match="must be one of elt, gemini"):
-        telescope_template("hale")
-    for name, text in example_files().items():
-        assert text == (ROOT / "examples" / name).read_text()
-    assert set(example_files()) == {path.name for path in (ROOT / "examples").glob("*.yaml")}
+    refused(lambda: telescope_template("hale"), ProblemError, "must be one of elt, gemini")
+    examples = {path.name: path.read_text() for path in (ROOT / "examples").glob("*.yaml")}
+    assert dict(example_files()) == examples
+    page = (ROOT / "docs" / "configuration.md").read_text()
+    smallest = write_config(tmp_path, page.split("```yaml\n")[1].split("```")[0])
+    assert lbt.load_config(smallest).design("kalman").certificate.passed
 
 
 @pytest.mark.parametrize("name", NAMES)

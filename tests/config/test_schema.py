@@ -3,29 +3,18 @@
 from lbt_synth.config.schema import config_schema
 
 SCHEMA = config_schema()
-UNITS = {
-    "_hz": "[Hz]",
-    "_nm": "[nm",
-    "_mas": "[mas]",
-    "_m": "[m]",
-    "_um": "[um]",
-    "_deg": "[deg]",
-    "_arcsec": "[arcsec]",
-    "_frames": "[frames]",
-}
+UNITS = {f"_{unit}": f"[{unit}]" for unit in ("mas", "m", "um", "deg", "arcsec", "frames")}
+UNITS |= {"_hz": "[Hz]", "_nm": "[nm"}
 COUNTS = {"settle_frames"}  # of frames, not in frames
 
 
-def test_every_key_has_a_description_with_its_unit():
+def test_editors_know_every_key_with_its_unit_and_what_is_required():
     for section in (SCHEMA, *SCHEMA["$defs"].values()):
         for key, value in section.get("properties", {}).items():
             assert value["description"]
             for ending, unit in UNITS.items():
                 if key.endswith(ending) and key not in COUNTS and "sensor_gain" not in key:
                     assert unit in value["description"], key
-
-
-def test_editors_know_every_key_and_what_is_required():
     for section in (SCHEMA, SCHEMA["$defs"]["LoopSection"]):
         assert section["additionalProperties"] is False
     assert SCHEMA["$schema"].endswith("2020-12/schema")

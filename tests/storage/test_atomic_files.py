@@ -2,9 +2,11 @@
 
 import os
 import stat
+from functools import partial
 from pathlib import Path
 
 import pytest
+from support.refusals import refused
 
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.storage.atomic_files import (
@@ -35,35 +37,29 @@ def test_what_is_not_there_or_no_name_is_no_input(tmp_path, monkeypatch):
     Path("ring").symlink_to("ring")
     refuse_replacing(["b.fits", "\0"], ["a.fits", "none.fits", "\0c", "ring"])
     require_writable("b.fits", inputs=["a.fits"])
-    with pytest.raises(OutputError, match=r"a\.fits must not replace the input \./a\.fits") as one:
-        require_writable("a.fits", inputs=["./a.fits"])
-    assert one.value.path == Path("a.fits")
-    with pytest.raises(OutputError, match="must not replace"):  # before either exists
-        refuse_replacing(["none.fits"], [tmp_path / "x" / ".." / "none.fits"])
+    replaced = r"a\.fits must not replace the input \./a\.fits"
+    error = refused(lambda: require_writable("a.fits", inputs=["./a.fits"]), OutputError, replaced)
+    assert error.path == Path("a.fits")
+    later = tmp_path / "x" / ".." / "none.fits"  # before either exists
+    refused(lambda: refuse_replacing(["none.fits"], [later]), OutputError, "must not replace")
 
 
 @every_writer
 def test_only_regular_files_are_replaced(tmp_path, write):
-    mine = tmp_path / "mine.txt"
-    mine.write_text("mine")
-    (tmp_path / "link").symlink_to(mine)
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "link").symlink_to("mine")
     (tmp_path / "broken").symlink_to("nowhere")
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "directory").mkdir()
     before = sorted(os.listdir(tmp_path))
     for name in ("link", "broken", "pipe", "directory", "é" * 128):  # the last has 256 bytes
-        for refused in (lambda p: write(p, b"new"), require_writable):
-            with pytest.raises(OutputError, match=r"is a|cannot write"):
-                refused(tmp_path / name)
-    assert mine.read_text() == "mine"
-    assert sorted(os.listdir(tmp_path)) == before
-
-
-def test_a_name_may_be_long_and_an_error_of_the_content_is_its_own(tmp_path):
+        for call in (partial(write, content=b"new"), require_writable):
+            refused(partial(call, tmp_path / name), OutputError, "is a|cannot write")
+    assert ((tmp_path / "mine").read_text(), sorted(os.listdir(tmp_path))) == ("mine", before)
+    write(tmp_path / ("a" * 255), b"new")
     with pytest.raises(ProblemError, match="one of the content"), open_atomically(tmp_path / "out"):
-        raise ProblemError("one of the content")
-    assert os.listdir(tmp_path) == []
-    assert write_atomically(tmp_path / ("a" * 255), b"all").read_bytes() == b"all"
+        raise ProblemError("one of the content")  # which stays its own
+    assert not (tmp_path / "out").exists()
 
 
 @every_writer
@@ -90,19 +86,17 @@ def test_a_full_disk_leaves_the_older_file_and_nothing_else(tmp_path, monkeypatc
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OutputError, match="cannot write .*No space left on device"):
-        write(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["out"]
+    refused(lambda: write(path, b"new"), OutputError, "cannot write .*No space left on device")
+    assert (path.read_bytes(), os.listdir(tmp_path)) == (b"old", ["out"])
 
 
 def test_one_at_a_time_holds_a_directory(tmp_path):
-    second = pytest.raises(OutputError, match="another run is running")
-    with exclusive_lock(tmp_path, "run"), second, exclusive_lock(tmp_path, "run"):
-        pass
-    with exclusive_lock(tmp_path, "run"):
-        pass
+    def hold(folder, *others):
+        with exclusive_lock(folder, "run"):
+            for other in others:
+                hold(other)
+
     (tmp_path / "odd" / ".lock").mkdir(parents=True)
-    no_lock = pytest.raises(OutputError, match=r"\.lock: Is a dir")
-    with no_lock, exclusive_lock(tmp_path / "odd", "run"):
-        pass
+    refused(lambda: hold(tmp_path, tmp_path), OutputError, "another run is running")
+    hold(tmp_path)  # it is free again
+    refused(lambda: hold(tmp_path / "odd"), OutputError, r"\.lock: Is a dir")

@@ -1,19 +1,10 @@
 """Wavefronts in the unit that people want to see."""
 
-from __future__ import annotations
-
 import pytest
+from support.refusals import refused
 
-from lbt_synth.storage.display_unit import (
-    nm_text,
-    own_display_unit,
-    show_in,
-    shown_format,
-    shown_unit,
-)
+from lbt_synth.storage import display_unit
 from lbt_synth.storage.rows import column, fact_table, json_record, nm_column, row_table, table_row
-
-MAS = ("mas", 10.0)
 
 
 @table_row
@@ -26,51 +17,38 @@ class Leaves:
 
 
 ROW = Leaves(name="a", residual_nm=27.46, frequency_hz=20.0)
+SHOWN = {
+    "nm": ("mas", pytest.approx(0.1)),
+    "nm\u00b2/Hz": ("mas\u00b2/Hz", pytest.approx(0.01)),
+    "nm^2": ("mas^2", pytest.approx(0.01)),
+    "nmi": ("nmi", 1.0),
+    "": ("", 1.0),
+}
 
 
-@pytest.mark.parametrize(
-    ("unit", "shown", "factor"),
-    [
-        ("nm", "mas", 0.1),
-        ("nm\u00b2/Hz", "mas\u00b2/Hz", 0.01),
-        ("nm^2", "mas^2", 0.01),
-        ("nmi", "nmi", 1.0),
-        ("", "", 1.0),
-    ],
-)
-def test_only_nanometres_change(unit, shown, factor):
-    assert shown_unit(unit) == (unit, 1.0)
-    with own_display_unit():
-        show_in(*MAS)
-        assert shown_unit(unit) == (shown, pytest.approx(factor))
-    assert shown_unit(unit) == (unit, 1.0)
+def test_only_nanometres_change_until_the_command_ends_even_if_it_fails():
+    plain = {unit: (unit, 1.0) for unit in SHOWN}
+    assert {unit: display_unit.shown_unit(unit) for unit in SHOWN} == plain
 
-
-def test_the_choice_ends_with_the_command_even_if_it_fails():
     def fail():
-        with own_display_unit():
-            show_in(*MAS)
+        with display_unit.own_display_unit():
+            display_unit.show_in("mas", 10.0)
+            assert {unit: display_unit.shown_unit(unit) for unit in SHOWN} == SHOWN
             raise ValueError("stop")
 
-    with pytest.raises(ValueError, match="stop"):
-        fail()
-    assert nm_text(5.0) == "5 nm"
+    refused(fail, ValueError, "stop")
+    assert {unit: display_unit.shown_unit(unit) for unit in SHOWN} == plain
+    assert display_unit.nm_text(5.0) == "5 nm"
 
 
-def test_digits_after_the_point_follow_the_size_of_the_unit():
-    assert shown_format(".1f", 0.1) == ".2f"
-    assert shown_format(".1f", 1 / 2055) == ".4f"
-    assert shown_format(".3g", 0.1) == ".3g"
-    with own_display_unit():
-        show_in(*MAS)
-        assert nm_text(27.46, ".1f", unit="nm rms") == "2.75 mas rms"
-        assert nm_text(27.46, error_nm=1.2) == "2.75 +- 0.12 mas"
-
-
-def test_tables_change_and_records_do_not():
+def test_tables_change_with_their_digits_and_records_do_not():
+    given = ((".1f", 0.1), (".1f", 1 / 2055), (".3g", 0.1))
+    assert [display_unit.shown_format(*pair) for pair in given] == [".2f", ".4f", ".3g"]
     assert row_table("t", [ROW]).headings[1] == "residual [nm]"
-    with own_display_unit():
-        show_in(*MAS)
+    with display_unit.own_display_unit():
+        display_unit.show_in("mas", 10.0)
+        assert display_unit.nm_text(27.46, ".1f", unit="nm rms") == "2.75 mas rms"
+        assert display_unit.nm_text(27.46, error_nm=1.2) == "2.75 +- 0.12 mas"
         table = row_table("t", [ROW])
         assert table.headings == ("design", "residual [mas]", "line [Hz]")
         assert table.rows == (("a", "2.75", "20"),)
