@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 24612,
+    "lines of tests": 24654,
     "lines of benchmarks": 3998,
     "words of docs": 62531,
 }

@@ -60,9 +60,10 @@ def places(tmp_path_factory, gains, recorded_night, sensors_config, sensors_file
     np.savez(folder / "SHORT.npz", measurements=y, commands=u)
     lbt.save_gain(folder / "STALE.fits", replace(ran, configuration='{"version": 3}'))
     lbt.save_gain(folder / "PREDICTOR.fits", made(residual_nm=106.2, alone_nm=167.4))
+    drift_file(folder).rename(folder / "DRIFT.yaml")
     names = {path.stem: path for path in folder.iterdir()}
     names |= {name.upper(): path for name, path in gains.items()}
-    names |= {"CONFIG": LBT_YAML, "DRIFT": drift_file(folder), "NIGHT": recorded_night}
+    names |= {"CONFIG": LBT_YAML, "NIGHT": recorded_night}
     names |= {"SENSORS": sensors_file, "SEVERAL": sensors_config.source}
     return names | {"FIXED": write_config(folder, minimal_config())}
 

@@ -1,5 +1,7 @@
 """The command study: run, killed, interrupted, replayed, on Dask."""
 
+import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -9,9 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import hear_interruptions, refuse_commands, run, run_done, run_json
-from support.studies import TWO, assert_whole, part_rows, read_table, study_file
+from support.studies import (
+    TWO,
+    assert_whole,
+    evaluate_quickly,
+    make_folder,
+    part_rows,
+    read_table,
+    study_file,
+)
 
 import lbt_synth as lbt
+from lbt_synth.errors import NumericalError
+from lbt_synth.storage.executors import connect_cluster
 from lbt_synth.studies.study.run import evaluate_samples
 
 PARAMETERS = (
@@ -136,3 +148,32 @@ def test_no_scheduler_and_one_without_workers(tmp_path, capsys, monkeypatch):
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
         address = empty.scheduler_address
         refuse_dask(capsys, tmp_path, address, "has no workers; start some with")
+
+
+def kills_its_worker(study, values, start):
+    """The first process that gets rows from 30 on ends; the file that it makes stops the others."""
+    if start >= 30:
+        with contextlib.suppress(FileExistsError):
+            Path(os.environ["STUDY_DIED"]).touch(exist_ok=False)
+            time.sleep(0.5)  # so that the first rows are written
+            os.kill(os.getpid(), signal.SIGKILL)
+    return evaluate_quickly(study, values, start)
+
+
+@pytest.mark.e2e
+def test_a_worker_killed_on_dask(tmp_path, monkeypatch):
+    """Two workers, of which one is killed: the study is started again, and nothing is lost."""
+    monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
+    study = lbt.studies.load_study(study_file(tmp_path, samples="60", parameters=PARAMETERS))
+    folder, how = make_folder(tmp_path), {"n_workers": 2, "threads_per_worker": 1}
+    with pytest.importorskip("distributed").LocalCluster(dashboard_address=":0", **how) as two:
+        two.scheduler.allowed_failures = 0  # one death is enough
+        with connect_cluster(two.scheduler_address) as (executor, workers):
+            options = {"executor": executor, "workers": workers, "evaluate": kills_its_worker}
+            with pytest.raises(NumericalError, match="start the study again"):
+                lbt.studies.run_study(study, folder, **options)
+            kept = sum(stop - start for start, stop in part_rows(folder))
+            again = lbt.studies.run_study(study, folder, **options)
+    assert 0 < kept < 60
+    assert (again.computed, again.failures) == (60 - kept, ())
+    assert_whole(folder, study)
