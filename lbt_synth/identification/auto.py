@@ -55,7 +55,7 @@ from lbt_synth.methods.request import design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import FloatArray, choice, require_instance
+from lbt_synth.validation import BoolArray, FloatArray, choice, require_instance
 
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
@@ -201,15 +201,15 @@ def design_from_record(
         inputs["penalty"] = regress(record, model, channels=beside).penalty
     made_of = partial(design_inputs, record, model, **inputs)
     allowed = allowed_gains(record, model) if finds_gain else None
-    design_of = lambda noise: request.build(made_of(noise=noise))  # noqa: E731
-    made, noise, price = design_for_gains(
+    design_of = lambda added_nm: request.build(made_of(added_nm=added_nm))  # noqa: E731
+    made, added_nm, price = design_for_gains(
         model, design_of, allowed, command_scale_known=command_scale_known
     )
     known = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
     title, tested = request.method.title, held_out
-    if noise > 1:
+    if added_nm.any():
         one = {method: requests[method]}
-        tested, designs = compare_designs(record, half, one, noise=noise, **inputs)
+        tested, designs = compare_designs(record, half, one, added_nm=added_nm, **inputs)
         notes.append(_say_price(price, tested.row(title), held_out.row(title)))
     if of_record := request.method.of_record:
         past = designs.get(title, made)
@@ -409,20 +409,22 @@ def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
 
 def design_for_gains(
     model: IdentifiedModel,
-    design: Callable[[float], Design],
+    design: Callable[[FloatArray], Design],
     allowed: FloatArray | None,
     *,
     command_scale_known: bool,
-) -> tuple[Design, float, str]:
+) -> tuple[Design, FloatArray, str]:
     """Return a design that is stable at all sensor gains that a record allows, and its noise.
 
-    ``design`` makes one that assumes a multiple of the model's noise. Commands that were recorded
-    at half their size look like twice the sensor gain; so unless their scale is known, half of the
-    gains are possible, and each axis may have those of both. Where the design is unstable at one of
+    ``design`` makes one that assumes more noise than the model, as phase of each axis [nm], which
+    is returned with it. Commands that were recorded at half their size look like twice the sensor
+    gain; so unless their scale is known, half of the gains are possible, and each axis may have
+    those of both. Where the design is unstable at one of
     them, or with a delay a tenth of a frame off, the one of least more noise that is stable takes
     its place, and a note says so.
     """
-    usual, assumed = design(1.0), list[str]()
+    none_nm, assumed = np.zeros(len(model.axes)), list[str]()
+    usual = design(none_nm)
     intervals = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
     if allowed is not None:
         intervals = allowed
@@ -440,14 +442,14 @@ def design_for_gains(
         assumed.append(sentence)
     bad = unstable_gains(usual, intervals)
     if bad is None:
-        return replace(usual, assumptions=(*assumed, *usual.assumptions)), 1.0, ""
+        return replace(usual, assumptions=(*assumed, *usual.assumptions)), none_nm, ""
     wanted = list[str]()
     if allowed is not None and not command_scale_known:
         wanted.append("--command-scale 1 if the commands were recorded at the size applied")
     if allowed is not None and np.any(allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]):
         wanted.append("--sensor-gain, which the record leaves open")
     advice = f". Give {' or '.join(wanted)}" if wanted else ""
-    stable = _assume_noise(design, intervals)
+    stable = _assume_noise(model, design, intervals, np.ones(len(model.axes), np.bool_))
     if stable is None:
         gain = ", ".join(f"{value:.3g}" for value in bad)
         raise CertificateError(
@@ -455,25 +457,42 @@ def design_for_gains(
             f"{DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. Record "
             f"with a higher loop gain, or look for jumps in it{advice}."
         )
-    safe, noise = stable
+    safe, added_nm = stable
+    quiet = np.flatnonzero(added_nm == 0)
+    where = (
+        " and ".join(f"axis {i}" for i in np.flatnonzero(added_nm)) if quiet.size else "each axis"
+    )
     note = (
         f"{'warning: ' * bool(wanted)}to be stable at sensor gains of {_in_words(intervals)}, and "
-        f"with a delay up to {DELAY_ERROR:g} frames off, the design assumes {noise:.3g} times the "
-        f"noise{advice}"
+        f"with a delay up to {DELAY_ERROR:g} frames off, the design assumes "
+        f"{nm_text(added_nm.max(), '.3g')} more noise on {where}{advice}"
     )
-    return replace(safe, assumptions=(*assumed, *safe.assumptions)), noise, note
+    return replace(safe, assumptions=(*assumed, *safe.assumptions)), added_nm, note
 
 
 def _assume_noise(
-    design: Callable[[float], Design], intervals: FloatArray
-) -> tuple[Design, float] | None:
-    """Return the design of least more noise that is stable at all gains, and the factor."""
+    model: IdentifiedModel,
+    design: Callable[[FloatArray], Design],
+    intervals: FloatArray,
+    noisy: BoolArray,
+) -> tuple[Design, FloatArray] | None:
+    """Return the design of least more noise that is stable at all gains, and that noise (n,) [nm].
+
+    It is the same on each of the noisy axes (n,), because what an axis sees of a shared line steers
+    the others, and none on axes that are stable without.
+    """
     designs = dict[int, Design]()
+    noises_nm = np.array([axis.noise_nm / axis.sensor_gain for axis in model.axes])
+
+    def added_nm(step: int) -> FloatArray:
+        """Return what raises the rms over the noisy axes by so many eighths of an octave."""
+        level_nm = np.sqrt((4.0 ** (step / 8) - 1) * np.mean(noises_nm[noisy] ** 2))
+        return np.where(noisy, level_nm, 0.0)
 
     def is_stable(step: int) -> bool:
-        """Whether there is a design that assumes so many eighths of an octave, and it is stable."""
+        """Whether there is a design that assumes so much, and it is stable."""
         with suppress(SynthesisError):
-            designs[step] = design(2.0 ** (step / 8))
+            designs[step] = design(added_nm(step))
             return unstable_gains(designs[step], intervals) is None
         return False
 
@@ -482,7 +501,13 @@ def _assume_noise(
     if last is None:
         return None
     least = bisect_left(range(last), True, lo=last - 7, key=is_stable)
-    return designs[least], 2.0 ** (least / 8)
+    for axis in sorted(np.flatnonzero(noisy).tolist(), key=noises_nm.__getitem__):
+        others = noisy & (np.arange(noisy.size) != axis)
+        less_nm = np.where(others, added_nm(least), 0.0)
+        with suppress(SynthesisError):
+            if others.any() and unstable_gains(calmer := design(less_nm), intervals) is None:
+                return _assume_noise(model, design, intervals, others) or (calmer, less_nm)
+    return designs[least], added_nm(least)
 
 
 def _in_words(intervals: FloatArray) -> str:

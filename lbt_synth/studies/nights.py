@@ -33,7 +33,7 @@ from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.validation import choice
+from lbt_synth.validation import FloatArray, choice
 
 ALL = "all nights"  # the design for all of them
 _LOOP = ("axes", "frame_rate_hz", "delay_frames", "diameter_m", "mirror")  # facts of one loop
@@ -170,8 +170,8 @@ def design_from_nights(
     weights = [residual_nm[night][night] ** -2 for night in made]
     gains = np.array([recorded.gains for recorded in made.values()])
 
-    def build(noise: float) -> Design:
-        plants = [noisier(recorded.model, noise).plant() for recorded in made.values()]
+    def build(added_nm: FloatArray) -> Design:
+        plants = [noisier(recorded.model, added_nm).plant() for recorded in made.values()]
         return design_request(chosen, {}).build(DesignInputs(plant=mean_plant(plants, weights)))
 
     try:

@@ -180,8 +180,8 @@ def test_gains_at_which_a_loop_is_unstable() -> None:
 
 
 def noisy(model: IdentifiedModel, synthesis=lbt.kalman, **options):
-    """Return how a filter is designed for a model and a multiple of its noise."""
-    return lambda factor: synthesis(noisier(model, factor).plant(), **options)
+    """Return how a filter is designed for a model and more noise."""
+    return lambda added_nm: synthesis(noisier(model, added_nm).plant(), **options)
 
 
 # a filter whose controller alone is unstable
@@ -192,25 +192,25 @@ NARROW = ((60.0, 0.004, 100.0),)  # frequency [Hz], damping, rms [nm]
 
 
 def design_for(model, allowed, *, known=True, make=noisy):
-    """Return the design, what it multiplies the noise by, and a note."""
+    """Return the design, the noise that it adds to each axis, and a note."""
     return auto.design_for_gains(model, make(model), allowed, command_scale_known=known)
 
 
 def beyond_its_margin(model: IdentifiedModel, factor: float = 1.1) -> np.ndarray:
     """Return gains from the model's to a factor beyond the largest of its filter's stable loop."""
     (gain,) = model.sensor_gains
-    _, high = lbt.loop.stable_sensor_gains(model.hardware, noisy(model)(1.0).controller)
+    _, high = lbt.loop.stable_sensor_gains(model.hardware, noisy(model)(0.0).controller)
     return np.array([[0.9 * gain, factor * high * gain]])
 
 
 def test_gains_that_the_fit_shows_keep_the_design() -> None:
     model = strong_loop()[1]
-    design, noise, note = design_for(model, np.array([[0.6, 1.2]]))
+    design, added_nm, note = design_for(model, np.array([[0.6, 1.2]]))
     assert design.method == "kalman"
     (text,) = design.assumptions
     assert "the loop is stable at all of these" in text
     assert "at the size that was applied, as was stated" in text
-    assert (noise, note) == (1.0, "")
+    assert (added_nm.tolist(), note) == ([0.0], "")
     free, *_ = design_for(model, None, known=False)
     assert free.assumptions == ()
 
@@ -219,20 +219,30 @@ def test_more_noise_is_assumed_where_the_fitted_design_is_unstable() -> None:
     """At the price that the note says: the least noise that is stable, to a tenth."""
     _, model = strong_loop(NARROW)
     allowed = beyond_its_margin(model)
-    factors = list[float]()
+    tried_nm = list[float]()
 
     def recorded(model: IdentifiedModel):
-        return lambda factor: factors.append(factor) or noisy(model)(factor)
+        return lambda nm: tried_nm.append(float(nm[0])) or noisy(model)(nm)
 
-    safe, noise, note = design_for(model, allowed, make=recorded)
+    safe, (added_nm,), note = design_for(model, allowed, make=recorded)
     assert auto.unstable_gains(safe, allowed) is None
     assert f"to be stable at sensor gains of {allowed[0, 0]:.3g} to" in note
-    assert f"the design assumes {noise:.3g} times the noise" in note
-    loops = [lbt.close_loop(model.hardware, each.controller) for each in (noisy(model)(1.0), safe)]
+    assert f"the design assumes {added_nm:.3g} nm more noise on each axis" in note
+    loops = [lbt.close_loop(model.hardware, each.controller) for each in (noisy(model)(0.0), safe)]
     least, paid = (lbt.residual_budget(loop, model.truth()).rms_nm for loop in loops)
     assert least < paid < 1.1 * least
-    stable = {f for f in factors if auto.unstable_gains(noisy(model)(f), allowed) is None}
-    assert min(stable) == noise < 1.15 * max(set(factors) - stable)
+    stable = {nm for nm in tried_nm if auto.unstable_gains(noisy(model)(nm), allowed) is None}
+    noise_nm = model.axes[0].noise_nm / model.axes[0].sensor_gain
+    (reached, failed) = np.hypot(noise_nm, [min(stable), max(set(tried_nm) - stable)])
+    assert added_nm == min(stable)
+    assert reached < 1.15 * failed
+    # an axis that is stable without stays as it is
+    calm = replace(model.axes[0], noise_nm=8 * model.axes[0].noise_nm)
+    both = replace(model, axes=(model.axes[0], calm))
+    safe, pair_nm, note = design_for(both, np.repeat(allowed, 2, axis=0))
+    assert auto.unstable_gains(safe, np.repeat(allowed, 2, axis=0)) is None
+    assert pair_nm == pytest.approx([added_nm, 0.0])
+    assert f"{added_nm:.3g} nm more noise on axis 0. Give" in note
     # a gain that the record leaves open is asked for
     wide = beyond_its_margin(model, 1.5) * [0.5, 1.0]
     *_, note = design_for(model, wide)
@@ -265,7 +275,7 @@ def test_axes_of_different_gains_may_have_those_of_both() -> None:
 
 def test_gains_at_which_nothing_is_stable_are_refused() -> None:
     model, wide = strong_loop()[1], np.array([[0.02, 0.9]])
-    stubborn = careless(model)(1.0)
+    stubborn = careless(model)(0.0)
     for known in (True, False):
         call = partial(design_for, model, wide, known=known, make=lambda _: lambda _: stubborn)
         error = refused(call, CertificateError, r"the record allows 0.0\d to 0.9")

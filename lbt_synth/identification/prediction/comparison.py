@@ -228,13 +228,14 @@ def design_inputs(
     model: IdentifiedModel,
     *,
     channels: Channels | None = None,
-    noise: float = 1.0,
+    added_nm: FloatArray | float = 0.0,
     penalty: float | None = None,
 ) -> DesignInputs:
     """Return what a method makes a design of: a model with more noise, its record and channels."""
+    beside: dict[str, Any] = {"channels": channels, "added_nm": added_nm}
     return DesignInputs(
-        plant=noisier(model, noise).plant(),
-        predict=lambda: regress(record, model, channels=channels, noise=noise).design(penalty),
+        plant=noisier(model, added_nm).plant(),
+        predict=lambda: regress(record, model, **beside).design(penalty),
     )
 
 

@@ -45,22 +45,13 @@ _FIRST = 2
 _REMOTE = 16.0  # frames, from which on a penalty grows with age: old readings tell least
 
 
-def added_noise_nm(model: IdentifiedModel, factor: float) -> float:
-    """Return what makes the noise a multiple, rms over the axes, as phase of each of them [nm]."""
-    noises_nm = [axis.noise_nm / axis.sensor_gain for axis in model.axes]
-    return float(np.sqrt((factor**2 - 1) * np.mean(np.square(noises_nm))))
-
-
-def noisier(model: IdentifiedModel, factor: float) -> IdentifiedModel:
-    """Return a model with a multiple of its noise, of which each axis gets the same share.
-
-    What an axis with little noise sees of a shared line steers the others, too: a multiple of its
-    own noise would leave it trusted where they are not.
-    """
-    added_nm = added_noise_nm(model, factor)
+def noisier(model: IdentifiedModel, added_nm: FloatArray | float) -> IdentifiedModel:
+    """Return a model with more noise, as phase of each axis (n,) or of all [nm]."""
     axes = (
-        replace(axis, noise_nm=float(np.hypot(axis.noise_nm, added_nm * axis.sensor_gain)))
-        for axis in model.axes
+        replace(axis, noise_nm=float(np.hypot(axis.noise_nm, more_nm * axis.sensor_gain)))
+        for axis, more_nm in zip(
+            model.axes, np.broadcast_to(added_nm, len(model.axes)).tolist(), strict=True
+        )
     )
     return replace(model, axes=tuple(axes))
 
@@ -244,18 +235,18 @@ def regress(
     model: IdentifiedModel,
     *,
     channels: Channels | None = None,
-    noise: float = 1.0,
+    added_nm: FloatArray | float = 0.0,
 ) -> Regression:
     """Collect what a record tells of its future, beside its model, of which the base is the filter.
 
-    More noise than the model's is added as that of a run without any disturbance, of which nothing
-    is to be corrected.
+    More noise than the model's, as phase of each axis, is added as that of a run without any
+    disturbance, of which nothing is to be corrected.
     """
     path = model.hardware
     if len(path.influence) != path.n_commands:
         raise ProblemError("a predictor needs a command for every mode; got fewer.")
     runs = record.stretches()
-    base = kalman(noisier(model, noise).plant()).controller
+    base = kalman(noisier(model, added_nm).plant()).controller
     series = record.pseudo_open_loop(model.sensor_gains)
     steering = close_loop(path, base).path("phase", "command")
     late, taps = held_fraction(path), path.mirror_taps
@@ -290,9 +281,9 @@ def regress(
     changes = np.concatenate([np.diff(signals[start:stop], axis=0) for start, stop in kept])
     scales = np.sqrt(np.mean(changes**2, axis=0))
     moments = [lagged_moments(signals, left, part, TAPS) for part in parts]
-    if noise > 1:
+    if np.any(added_nm):
         drawn = np.random.default_rng(1).standard_normal((count + first, path.modes))
-        drawn *= added_noise_nm(model, noise)
+        drawn *= added_nm
         silence = np.zeros((len(drawn), beside.shape[1]))
         heard, left, _, target = lay(drawn, ((0, len(drawn)),), silence)
         for place, (a, b) in enumerate(pairwise(edges)):

@@ -129,15 +129,16 @@ def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
 
 
 def test_more_noise_is_trusted_less() -> None:
-    """The command of white noise falls, the residual rises; all axes get the same more noise."""
+    """The command of white noise falls, and the residual rises; it is phase that is added."""
     _, record, model = vibrating()
-    calm, usual = regression.regress(record, model, noise=8.0).design(), predictor(channels=False)
+    more_nm = 8 * np.array([axis.noise_nm for axis in model.axes])
+    calm = regression.regress(record, model, added_nm=more_nm).design()
+    usual = predictor(channels=False)
     assert max(calm.claims["command_rms"]) < 0.8 * max(usual.claims["command_rms"])
     assert left_nm2(calm) > left_nm2(usual)
-    first, second = (replace(model.axes[0], noise_nm=nm, sensor_gain=2.0) for nm in (2.0, 14.0))
-    both = replace(model, axes=(first, second))
-    noises_nm = [axis.noise_nm for axis in regression.noisier(both, 8.0).axes]
-    assert np.square(noises_nm) == pytest.approx(np.array([4, 196]) + 63 * (4 + 196) / 2)
+    pair = replace(model, axes=2 * (replace(model.axes[0], noise_nm=3.0, sensor_gain=2.0),))
+    noisier = regression.noisier(pair, np.array([2.0, 0.0]))
+    assert [axis.noise_nm for axis in noisier.axes] == pytest.approx([5.0, 3.0])
 
 
 def test_gains_and_delays_that_are_not_whole() -> None:
