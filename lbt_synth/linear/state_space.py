@@ -393,6 +393,11 @@ def stacked_response(
     Several ``A, B, C, D`` have partial fractions. Where those of one, whose eigenvectors are nearly
     dependent, fail at some probes, its points are solved one by one.
     """
+    rows = np.hstack([part.reshape(len(part), -1) for part in matrices])
+    _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    if first.size < len(rows):  # equal ones are computed once
+        respond_once = stacked_response(tuple(part[first] for part in matrices))
+        return lambda z: respond_once(z)[:, which.ravel()]
     A, B, C, D = matrices
     if not A.size:
         return lambda z: np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))

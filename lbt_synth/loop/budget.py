@@ -233,21 +233,24 @@ def random_density(
     """
     n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
     turbulence, vibrations, noise = truth.entering(loop.hardware, sensor_gain=loop.sensor_gain)
-    origins = [(spectrum, np.eye(n)[:, modes]) for spectrum, modes in turbulence]
+    origins = [(spectrum, np.eye(n)[:, modes], 1.0) for spectrum, modes in turbulence]
     for line in vibrations:
         if isinstance(line, Vibration):
-            along = np.sinc(line.frequency_hz / rate) * checked_direction(line, loop.hardware)
-            origins.append((line.ar_model(rate), along[:, None]))
+            along = np.array(checked_direction(line, loop.hardware))[:, None]
+            origins.append((line.ar_model(rate), along, np.sinc(line.frequency_hz / rate) ** 2))
     rows, factor = loop_evaluator(loop, in_image=in_image), _noise_factor(loop, noise)
     seen = replace(rows, B=rows.B[..., n:] @ factor, D=rows.D[..., n:] @ factor).system()
     response = seen.phase_response(frequency_hz)  # (f, phases, pieces n, p)
     pieces = np.abs(response.reshape(*response.shape[:2], -1, n, factor.shape[1])) ** 2
     total = 2 / rate * np.einsum("g,ftgip->fi", (rows.hold or STILL).weights, pieces)
-    for spectrum, entry in origins:
-        density = spectrum_density(spectrum, frequency_hz)
+    powers: dict[bytes, FloatArray] = {}  # that origins leave by an entry, the same for many
+    for spectrum, entry, share in origins:
+        density = share * spectrum_density(spectrum, frequency_hz)
         if isinstance(spectrum, ARModel) == in_image:  # a process is one of means over frames
             density *= np.sinc(frequency_hz / rate) ** (-2 if in_image else 2)
-        total += np.einsum("hiift->fi", rows.powers(entry[None])(frequency_hz)) * density[:, None]
+        if (key := entry.tobytes()) not in powers:
+            powers[key] = np.einsum("hiift->fi", rows.powers(entry[None])(frequency_hz))
+        total += powers[key] * density[:, None]
     return np.asarray(total / rows.phases)
 
 

@@ -34,7 +34,7 @@ from lbt_synth.validation import (
 
 _DIRECTIONS = 64  # of nodes in half a turn, for jitter of at most _TURNS
 _TURNS = 5.0  # of phase over the pupil; beyond them the nodes are made denser
-_FEW_TURNS = np.array([1.5, 0.7, 0.25])  # below each, half of the directions is as good: 1e-9
+_FEW_TURNS = np.array([1.5, 0.7, 0.25])  # below each, half of the directions is as good: 2e-9
 _FEW_RADII = {-1: 24, -2: 20, -3: 10}  # that are as good where the directions are fewer
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
@@ -137,7 +137,7 @@ def strehl(
             )
     _require_axes(jitter.shape[-1])
     jitter, lines = jitter[stable], lines[stable]
-    deviation = np.sqrt(np.max(np.diagonal(jitter, axis1=1, axis2=2), axis=1))
+    deviation = np.sqrt(np.maximum(np.linalg.eigvalsh(jitter)[:, -1], 0.0))
     spread = (deviation + np.sum(np.abs(lines), axis=(1, 2))) * imaging.cycles_per_nm
     ratios, near = np.zeros(len(spread)), spread <= _MOST_TURNS
     if np.any(near):

@@ -31,7 +31,7 @@ from bokeh.plotting import figure as new_figure
 from bokeh.server.server import Server
 
 from lbt_synth.config import Config
-from lbt_synth.config.load import build_config
+from lbt_synth.config.load import build_config, validate_sections
 from lbt_synth.config.samples import with_values
 from lbt_synth.config.schema import FileSection, TrueVibrationSection
 from lbt_synth.config.write import config_text
@@ -153,13 +153,19 @@ def _true_lines(config: Config, settings: FileSection) -> list[TrueVibrationSect
         return settings.truth.vibrations
     sections, lines = [], config.plant.vibrations
     errors = config.truth.frequency_errors_hz or (None,) * len(lines)
-    for line, error_hz in zip(lines, errors, strict=True):
+    every = config.plant.motions or ({},) * len(lines)
+    for line, error_hz, motions in zip(lines, errors, every, strict=True):
         names = ("frequency_hz", "damping", "rms_nm", "sections")
         content = {"kind": "resonance"} | {name: getattr(line, name) for name in names}
         if len(line.direction) == 2:
             content["direction_deg"] = float(np.degrees(np.arctan2(*line.direction[::-1])))
         if error_hz is not None:
             content["frequency_error_hz"] = error_hz
+        if motions:
+            content["accelerometers"] = {
+                name: {"motion_nm_per_nm": motion.size, "phase_deg": motion.phase_deg}
+                for name, motion in motions.items()
+            }
         sections.append(TrueVibrationSection(**content))
     return sections
 
@@ -170,7 +176,8 @@ def move(config: Config, values: Mapping[str, float]) -> Config:
     for knob in list_knobs(config):
         if knob.key in values:
             settings = knob.edit(settings, min(max(values[knob.key], knob.low), knob.high))
-    return build_config(settings, config.source)
+    content = settings.model_dump(exclude_unset=True)
+    return build_config(validate_sections(FileSection, content, config.source), config.source)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -305,7 +312,7 @@ def judge(view: View) -> str:
     gain = config.truth.sensor_gain
     if not row.stable:
         ends = stable_sensor_gains(config.hardware, view.design.controller)
-        low, high, real = (f"{config.sensor_gain * factor:.2f}" for factor in (*ends, gain))
+        low, high, real = (f"{config.sensor_gain * factor:.4g}" for factor in (*ends, gain))
         return (
             f"{view.name} is stable at sensor gains of {low} to {high}; at {real} this loop is "
             f"UNSTABLE. {checks}"
@@ -532,8 +539,8 @@ def serve(
     for name, design in designs.items():
         require_compatible(name, design, start.hardware)
     first, saved = new_view(start, designs), list[Path]()
-    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    names = dict.fromkeys(("0.0.0.0", "::"), socket.gethostname()) | {"::1": "localhost"}
+    name, family = names.get(host, host), socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         with socket.create_server((host, port), family=family) as probe:
             place = probe.getsockname()[1]
@@ -544,7 +551,7 @@ def serve(
             port=place,
             allow_websocket_origin=[*hosts, *origins],
         )
-    except (OSError, UnicodeError) as error:  # a name of another alphabet, or too long
+    except (OSError, ValueError) as error:  # a name of another alphabet, or too long
         reason = getattr(error, "strerror", None) or str(error)
         raise ProblemError(
             f"cannot serve at --host {host} --port {port}: {reason}. Try another one; --port 0 is "

@@ -76,12 +76,16 @@ def evaluate(
     if executor is None:
         yield from starmap(function, samples)
         return
-    running = [executor.submit(function, *sample) for sample in samples]
+    running: list[futures.Future[Answer]] = []
     try:
-        for row, future in enumerate(running):
-            with _explain_failure((row, row + 1)):
-                answer = future.result()
-            yield answer
+        running += [executor.submit(function, *sample) for sample in samples]
+        for future in running:
+            yield future.result()
+    except (futures.BrokenExecutor, futures.CancelledError) as error:
+        raise NumericalError(
+            f"a worker of the executor died ({type(error).__name__}), perhaps out of memory. Start "
+            "it again, perhaps with fewer workers."
+        ) from error
     finally:
         for future in running:
             future.cancel()

@@ -130,3 +130,18 @@ def test_wrong_input_is_refused():
     calls += [partial(series_strehl, wrong, CAMERA) for wrong in series]
     calls += [partial(lbt.Imaging, diameter_m=d, other_modes=m) for d, m in ((8, 1.2), (0, 1))]
     require_refusals((call, ProblemError, ".") for call in calls)
+
+
+@pytest.mark.parametrize("obstruction", [0.0, 0.11, 0.9])
+def test_a_turned_jitter_has_the_same_image(obstruction):
+    """The pupil is round: at spreads on both sides of those from which nodes are fewer."""
+    camera = lbt.Imaging(diameter_m=8.0, obstruction=obstruction)
+    for turns in (0.1, 0.249, 0.251, 0.69, 0.71, 1.49, 1.51, 3.0):
+        variance, line = (
+            (0.6 * turns / camera.cycles_per_nm) ** 2,
+            0.3 * turns / camera.cycles_per_nm,
+        )
+        along = lbt.strehl([[variance, 0], [0, 0]], camera, line_amplitudes_nm=[[line, 0]])
+        half = np.full((2, 2), variance / 2)
+        turned = lbt.strehl(half, camera, line_amplitudes_nm=[[line * 0.5**0.5] * 2])
+        assert turned == pytest.approx(along, abs=3e-9), turns

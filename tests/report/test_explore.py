@@ -63,7 +63,7 @@ def test_the_verdict(start, first):
     assert text.endswith(certified)
     unstable = judge(new_view(start, {}, "kalman", {"gain": 2.4}))
     ends = lbt.loop.stable_sensor_gains(start.hardware, first.design.controller)
-    words = "Kalman is stable at sensor gains of {:.2f} to {:.2f}; at 2.40 this loop is UNSTABLE."
+    words = "Kalman is stable at sensor gains of {:.4g} to {:.4g}; at 2.4 this loop is UNSTABLE."
     assert unstable == f"{words.format(*ends)} {certified}"
     assert judge(new_view(start, {}, "hinf", {"gain": 0.6})).startswith("WARNING: 0.0")
 
@@ -174,6 +174,14 @@ def test_a_shift_moves_the_truth_alone(tmp_path, five):
     damped = move(five, {"damping": 0.02})  # what is assumed leaves the truth
     assert [line.damping for line in damped.plant.vibrations] == pytest.approx([0.02] * 10)
     assert [line.damping for line in damped.truth.vibrations] == [0.005] * 10
+
+
+def test_lines_that_accelerometers_see_and_values_that_no_file_holds(tmp_path, sensors_config):
+    for values in ({"shift": 0.0}, {"damping": 0.02}):
+        assert move(sensors_config, values).truth.motions == sensors_config.truth.motions
+    quiet = write_config(tmp_path, change_key(("sensor",), {"noise_nm": 2e-3}))
+    with pytest.raises(lbt.errors.ConfigError, match="noise_nm"):
+        move(lbt.load_config(quiet), {"noise": 4e-4})
 
 
 def test_the_loop_and_the_sky(tmp_path, five):
