@@ -82,10 +82,8 @@ def evaluate(
         for future in running:
             yield future.result()
     except (futures.BrokenExecutor, futures.CancelledError) as error:
-        raise NumericalError(
-            f"a worker of the executor died ({type(error).__name__}), perhaps out of memory. Start "
-            "it again, perhaps with fewer workers."
-        ) from error
+        died = f"a worker of the executor died ({type(error).__name__}), perhaps out of memory"
+        raise NumericalError(f"{died}. Start it again, perhaps with fewer workers.") from error
     finally:
         for future in running:
             future.cancel()

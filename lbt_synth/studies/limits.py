@@ -70,8 +70,7 @@ def limits(
     """Evaluate designs exactly under a truth, and compare them with the limits.
 
     The errors are true frequencies less those of the model [Hz], of the vibration that moves most;
-    the others move in proportion, over the whole range between the extremes. An executor works on
-    all designs at once.
+    the others move in proportion, over the whole range between the extremes.
     """
     if not designs:
         raise ProblemError("a study of limits needs at least one design; got none.")

@@ -51,8 +51,7 @@ def run_design(
 ) -> DesignRun:
     """Run the loop of a configuration for some frames and cases; sensors may fail on the way.
 
-    A controller that estimates is given the commands that a mirror of this stroke applied. An
-    executor works on all times between failures at once.
+    A controller that estimates is given the commands that a mirror of this stroke applied.
     """
     loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
     loop.require_stable()
