@@ -26,16 +26,16 @@ LINES = {
     "models": 3749,
     "report": 3279,
     "storage": 1126,
-    "studies": 3204,
+    "studies": 3200,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 24690,
+    "lines of tests": 24692,
     "lines of benchmarks": 3998,
-    "words of docs": 59710,
+    "words of docs": 59812,
 }
 
 
