@@ -351,7 +351,7 @@ def save_view(start: Config, view: View, folder: Path) -> tuple[list[Path], tupl
 
 
 _QUICK_S = 0.3  # a design that takes longer is made when a slider is released
-_TICK_MS = 20  # in which moves of a slider become one wish
+_TICK_MS = 1  # moves that wait while a design is made become one wish
 
 
 def new_panel(title: str) -> tuple[Any, ColumnDataSource, ColumnDataSource]:
