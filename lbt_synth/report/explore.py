@@ -540,10 +540,11 @@ def serve(
         require_compatible(name, design, start.hardware)
     first, saved = new_view(start, designs), list[Path]()
     names = dict.fromkeys(("0.0.0.0", "::"), socket.gethostname()) | {"::1": "localhost"}
-    name, family = names.get(host, host), socket.AF_INET6 if ":" in host else socket.AF_INET
+    name, place = names.get(host, host), port
     try:
-        with socket.create_server((host, port), family=family) as probe:
-            place = probe.getsockname()[1]
+        for family, *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            with socket.create_server((address[0], place), family=family) as probe:
+                place = probe.getsockname()[1]
         hosts = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
         server = Server(
             {"/": lambda document: Session(document, start, designs, first, folder, saved)},
