@@ -66,10 +66,3 @@ def minimal_config(**sections):
     for name, keys in sections.items():
         out[name] = {**out.get(name, {}), **keys}
     return out
-
-
-def write_vibration(tmp_path, **vibration):
-    """Write the good file with changed keys of its first vibration; return its path."""
-    content = copy.deepcopy(GOOD)
-    content["model"]["vibrations"][0] |= vibration
-    return write_config(tmp_path, content)

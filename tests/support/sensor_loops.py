@@ -132,14 +132,6 @@ def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuc
     return residual
 
 
-def impulse(frames, runs, size, entries):
-    """Return a signal (frames, runs, size) of unit impulses: (run, frame, column) each."""
-    out = np.zeros((frames, runs, size))
-    for run, frame, column in entries:
-        out[frame, run, column] = 1.0
-    return out
-
-
 def simulated_covariances(plant, controller, *, frames=300, **loop):
     """Return the residual's covariances (n, n) by origin: turbulence, vibrations, noise.
 
