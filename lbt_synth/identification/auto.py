@@ -419,9 +419,8 @@ def design_for_gains(
     ``design`` makes one that assumes more noise than the model, as phase of each axis [nm], which
     is returned with it. Commands that were recorded at half their size look like twice the sensor
     gain; so unless their scale is known, half of the gains are possible, and each axis may have
-    those of both. Where the design is unstable at one of
-    them, or with a delay a tenth of a frame off, the one of least more noise that is stable takes
-    its place, and a note says so.
+    those of both. Where the design is unstable at one of them, or with a delay a tenth of a frame
+    off, the one of least more noise that is stable takes its place, and a note says so.
     """
     none_nm, assumed = np.zeros(len(model.axes)), list[str]()
     usual = design(none_nm)
@@ -458,10 +457,8 @@ def design_for_gains(
             f"with a higher loop gain, or look for jumps in it{advice}."
         )
     safe, added_nm = stable
-    quiet = np.flatnonzero(added_nm == 0)
-    where = (
-        " and ".join(f"axis {i}" for i in np.flatnonzero(added_nm)) if quiet.size else "each axis"
-    )
+    axes = " and ".join(f"axis {i}" for i in np.flatnonzero(added_nm))
+    where = "each axis" if added_nm.all() else axes
     note = (
         f"{'warning: ' * bool(wanted)}to be stable at sensor gains of {_in_words(intervals)}, and "
         f"with a delay up to {DELAY_ERROR:g} frames off, the design assumes "

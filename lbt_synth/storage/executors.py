@@ -41,9 +41,8 @@ def limit_threads() -> Iterator[None]:
 class WorkerPool(ProcessPoolExecutor):
     """Fresh processes that end with their parent, however it ends.
 
-    Start it within :func:`limit_threads`, whose limit the
-    processes inherit. An error in its ``with`` block ends them at once, without waiting for what is
-    running.
+    Start it within :func:`limit_threads`, whose limit the processes inherit. An error in its
+    ``with`` block ends them at once, without waiting for what is running.
     """
 
     def __init__(self, workers: int) -> None:

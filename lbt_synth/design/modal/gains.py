@@ -213,6 +213,8 @@ def modal_gains_from_telemetry(
     >>> bool(abs(best.noise_nm[0] - 5) < 0.5), bool(0.1 < best.gains[0] < 0.25)
     (True, True)
     """
+    from scipy.signal import welch  # slow to import
+
     path = require_instance(hardware, LoopHardware, "hardware").single_mode()
     rate, taps = path.frame_rate_hz, path.mirror_taps
     y, u = real_array(measurements, "measurements"), real_array(commands, "commands")
@@ -221,8 +223,6 @@ def modal_gains_from_telemetry(
             f"measurements and commands must both be (frames, modes); got {y.shape} and {u.shape}."
         )
     y, u = y.T, u.T
-    from scipy.signal import welch  # slow to import
-
     count, frames = y.shape
     segment = integer(segment_frames, "segment_frames", at_least=16)
     gain = number_per_mode(sensor_gain, "sensor_gain", count, above=0)

@@ -47,11 +47,10 @@ _REMOTE = 16.0  # frames, from which on a penalty grows with age: old readings t
 
 def noisier(model: IdentifiedModel, added_nm: FloatArray | float) -> IdentifiedModel:
     """Return a model with more noise, as phase of each axis (n,) or of all [nm]."""
+    phases_nm = np.broadcast_to(added_nm, len(model.axes)).tolist()
     axes = (
-        replace(axis, noise_nm=float(np.hypot(axis.noise_nm, more_nm * axis.sensor_gain)))
-        for axis, more_nm in zip(
-            model.axes, np.broadcast_to(added_nm, len(model.axes)).tolist(), strict=True
-        )
+        replace(axis, noise_nm=float(np.hypot(axis.noise_nm, phase_nm * axis.sensor_gain)))
+        for axis, phase_nm in zip(model.axes, phases_nm, strict=True)
     )
     return replace(model, axes=tuple(axes))
 
