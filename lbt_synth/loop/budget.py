@@ -322,6 +322,7 @@ def residual_of_parts(
                     equal[key] = part.of_turbulence(spectrum, entry)
                 air[at] += equal.get(key, 0.0)
     amplitudes: list[ComplexArray] = []
+    alike: dict[object, FloatArray] = {}  # of lines on other modes of equal parts
     for line in lines:
         pairs = ((part, some) for part in parts for some in part.modes)
         part, some = next(pair for pair in pairs if np.any(line.direction[:, pair[1]]))
@@ -330,7 +331,11 @@ def residual_of_parts(
         if line.damping is not None:
             rms_nm = line.rms_nm * (1.0 if of_means else np.sinc(f))
             numbers = line.frequency_hz, line.damping, rms_nm, rate, line.sections
-            shaken[at] += part.of_process(*sampled_lines(*numbers), along[..., None])
+            coefficients, driving_nm = sampled_lines(*numbers)
+            same = (id(part), coefficients.tobytes(), driving_nm.tobytes(), along.tobytes())
+            if same not in alike:
+                alike[same] = part.of_process(coefficients, driving_nm, along[..., None])
+            shaken[at] += alike[same]
             continue
         entry = np.zeros((len(f), part.B.shape[2]), dtype=np.complex128)
         entry[:, : some.size] = along

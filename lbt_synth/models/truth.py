@@ -155,20 +155,24 @@ class Truth(Summarised):
         nearest = np.argmin(np.abs(np.log(places / frequency_hz)))
         return float(self.frequency_shifts_hz(error_hz)[nearest])
 
-    def with_frequency_error(self, error_hz: float) -> Truth:
-        """Return a truth whose vibrations have moved, the one that moves most by an error [Hz]."""
-        moved = []
-        lines = stationary_vibrations(self.vibrations)
-        for line, shift in zip(lines, self.frequency_shifts_hz(error_hz), strict=True):
-            frequency_hz = line.frequency_hz + float(shift)
+    def moved_hz(self, error_hz: float) -> FloatArray:
+        """Return frequencies (vibrations,) if the vibration that moves most does so by an error."""
+        before = np.array([line.frequency_hz for line in stationary_vibrations(self.vibrations)])
+        moved = before + self.frequency_shifts_hz(error_hz)
+        for frequency_hz, line_hz in zip(moved, before, strict=True):
             if not frequency_hz > 0:
                 raise ProblemError(
                     f"errors_hz must leave each vibration above 0 Hz; got an error of "
-                    f"{error_hz:.6g} Hz, which moves the one at {line.frequency_hz:.6g} Hz to "
+                    f"{error_hz:.6g} Hz, which moves the one at {line_hz:.6g} Hz to "
                     f"{frequency_hz:.6g} Hz. Try a smaller one, or a smaller error of this line."
                 )
-            moved.append(replace(line, frequency_hz=frequency_hz))
-        return replace(self, vibrations=tuple(moved))
+        return np.asarray(moved)
+
+    def with_frequency_error(self, error_hz: float) -> Truth:
+        """Return a truth whose vibrations have moved, the one that moves most by an error [Hz]."""
+        pairs = zip(self.vibrations, self.moved_hz(error_hz).tolist(), strict=True)
+        moved = tuple(replace(line, frequency_hz=frequency_hz) for line, frequency_hz in pairs)
+        return replace(self, vibrations=moved)
 
     @property
     def drifts(self) -> bool:

@@ -278,8 +278,7 @@ def robustness_map(
         )
     for line in stationary_vibrations(truth.vibrations):
         checked_direction(line, hardware)
-    moved = [truth.with_frequency_error(error).vibrations for error in errors.tolist()]
-    moved_hz = np.array([[line.frequency_hz for line in lines] for lines in moved])  # (e, lines)
+    moved_hz = np.array([truth.moved_hz(error) for error in errors.tolist()])  # (e, lines)
     require_matching_controller(hardware.own_sensor_alone(), as_controller(design))
     size = delays.size, gains.size, errors.size
     matrices = textbook_matrices([as_controller(design)])

@@ -166,6 +166,18 @@ def test_a_loop_is_split_into_parts():
         assert ([own.tolist() for own, *_ in parts], rest) == (modes, [])
 
 
+@pytest.mark.parametrize("name", ["kalman", "coupled", "uneven"])
+def test_equal_lines_on_both_axes_leave_what_each_leaves_alone(name):
+    facts = {"frequency_hz": 21.0, "damping": 0.01, "rms_nm": 50.0}
+    lines = [EnsembleVibration(**facts, direction=along) for along in ((1, 0), (0, 1))]
+    both, *alone = (
+        ensemble_residuals(designed(name), LoopEnsemble(sensor_gain=[0.8, 1], vibrations=some))
+        for some in (lines, lines[:1], lines[1:])
+    )
+    expected = sum(one.random_vibration_nm2 for one in alone)
+    np.testing.assert_allclose(both.random_vibration_nm2, expected, rtol=1e-9, atol=1e-9)
+
+
 def test_states_in_odd_units_stay_coupled():
     """The same controller in states of 1e9 times other units is the same controller."""
     path, k = designed("coupled").hardware, designed("coupled").controller

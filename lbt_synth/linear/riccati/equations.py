@@ -262,18 +262,19 @@ def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, i
     doi:10.1080/00207170410001714988. After j steps the iterate holds 2^j steps of the Riccati
     recursion; the convergence is quadratic. G need not be semidefinite. Return X, nan where the
     iteration did not converge, and the most steps made. States that do not act on one another,
-    such as those of two axes, are iterated apart.
+    such as those of two axes, are iterated apart: blocks of one size as one stack.
     """
     label = component_labels(np.any((A != 0) | (G != 0) | (H != 0), axis=0))
-    solutions, steps = np.zeros_like(H), 0
-    for number in range(np.max(label, initial=-1) + 1):
-        block = np.ix_(range(len(A)), label == number, label == number)
-        solutions[block], made = _doubling_of_block(A[block], G[block], H[block])
-        steps = max(steps, made)
+    solutions, steps, sizes = np.zeros_like(H), 0, np.bincount(label)
+    for n in np.unique(sizes):
+        states = np.array([np.flatnonzero(label == one) for one in np.flatnonzero(sizes == n)])
+        blocks = np.s_[:, states[:, :, None], states[:, None, :]]  # (N, blocks, n, n)
+        X, made = _doubling_of_blocks(*(one[blocks].reshape(-1, n, n) for one in (A, G, H)))
+        solutions[blocks], steps = X.reshape(len(A), len(states), n, n), max(steps, made)
     return solutions, steps
 
 
-def _doubling_of_block(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, int]:
+def _doubling_of_blocks(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, int]:
     """Double equations until each has converged or diverged, when it leaves the stack."""
     X, going, n, step = H, np.arange(len(A)), A.shape[-1], 0
     one, solutions = np.eye(n), np.full_like(H, np.nan)

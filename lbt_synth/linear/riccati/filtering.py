@@ -12,7 +12,7 @@ Control", SIAM (1999), doi:10.1137/1.9781611970760, chapter 4 (a-priori filter).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import cache, lru_cache, reduce
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -71,6 +71,7 @@ def require_detectable(problem: EstimationProblem) -> None:
     require_seen(A_s.T, B_s.T, words, drive=problem.C.T, only_unit_circle=True)
 
 
+@lru_cache(maxsize=2)
 def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     """Solve ``P = A P A' + Q - (A P C' + S)(R + C P C')^-1 (C P A' + S')``, for all phases."""
     scaled, units = _in_noise_units(problem)

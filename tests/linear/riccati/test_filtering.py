@@ -198,7 +198,7 @@ def test_equations_that_are_not_solved(monkeypatch):
     ]
     require_refusals(rows)
     for limit, call, words in (
-        ("ERROR_LIMIT", partial(kalman_riccati, problem), short),
+        ("ERROR_LIMIT", partial(kalman_riccati, walk()), short),
         ("_RESIDUAL_LIMIT", partial(gamma_riccati, problem, 10.0), f"{short} residual of"),
     ):
         with monkeypatch.context() as patch:
