@@ -18,24 +18,24 @@ LINES = {
     "config": 1622,
     "design": 5985,
     "files": 1252,
-    "identification": 8878,
+    "identification": 8874,
     "interop": 3687,
-    "linear": 4754,
-    "loop": 3956,
+    "linear": 4756,
+    "loop": 3961,
     "methods": 784,
-    "models": 3749,
-    "report": 3279,
-    "storage": 1126,
-    "studies": 3200,
+    "models": 3753,
+    "report": 3324,
+    "storage": 1125,
+    "studies": 3199,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 24692,
+    "lines of tests": 24719,
     "lines of benchmarks": 3998,
-    "words of docs": 59812,
+    "words of docs": 59983,
 }
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -59,6 +59,7 @@ from lbt_synth.validation import FloatArray
 Curve: TypeAlias = tuple[FloatArray, FloatArray]  # abscissae and ordinates, in units that are shown
 Designs: TypeAlias = Mapping[str, Design]
 SHIFT = "shift"  # key of the knob that moves the true lines
+STREHL = "Strehl ratio"  # title of the figure that takes longer than the others
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +186,8 @@ class Shown:
     """What the page shows of a design; nan in an unstable loop."""
 
     curves: Mapping[str, Curve]  # by the titles of figures; none of an error without an estimate
-    residual_nm: float  # this and what follows: where the true lines are now
-    strehl: float
+    residual_nm: float = np.nan  # this and what follows: where the true lines are now
+    strehl: float = np.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -196,19 +197,30 @@ class View:
     config: Config
     request: DesignRequest
     moves: str  # the sliders that were moved, as people read them
-    design: Design
+    shift_hz: float  # by which the true lines have moved from where they are at the start
+    designs: Designs
     shown: Mapping[str, Shown]
 
     @property
     def name(self) -> str:
         """Name of the design."""
-        return next(iter(self.shown))
+        return next(iter(self.designs))
+
+    @property
+    def design(self) -> Design:
+        """The design of the method where the sliders are."""
+        return self.designs[self.name]
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the Strehl ratios are computed."""
+        return STREHL in self.shown[self.name].curves
 
 
 def new_view(
     start: Config, designs: Designs, method: str = "", values: Mapping[str, float] | None = None
 ) -> View:
-    """Design, and return what the page shows of the design and of those to compare with."""
+    """Design, and return the curves of the loop of the design and of those to compare with."""
     name, moved = method or default_method(), values or {}
     config = move(start, moved)
     request = design_request(name, method_named(name).reference_options)
@@ -221,16 +233,26 @@ def new_view(
         if knob.key in moved
         for unit, factor in (shown_unit(knob.unit),)
     )
+    every = {label: design, **designs}
     return View(
         config=config,
         request=request,
         moves=", ".join(moves),
-        design=design,
-        shown={
-            title: show_design(one, config, start, moved.get(SHIFT, 0.0))
-            for title, one in {label: design, **designs}.items()
-        },
+        shift_hz=moved.get(SHIFT, 0.0),
+        designs=every,
+        shown={title: Shown(curves=loop_curves(one, config)) for title, one in every.items()},
     )
+
+
+def whole_view(view: View, start: Config) -> View:
+    """Return a view with what its designs leave, too, which takes longer than their curves."""
+    if view.is_whole:
+        return view
+    shown = {
+        name: with_image(one, view.designs[name], view.config, start, view.shift_hz)
+        for name, one in view.shown.items()
+    }
+    return replace(view, shown=shown)
 
 
 # The figures of the page: what is on their axes, with units of wavefronts in braces; scales over
@@ -239,7 +261,7 @@ FIGURES = {
     "Rejection": ("frequency [Hz]", "\u03c3\u0304, phase to residual [-]"),
     "Noise": ("frequency [Hz]", "\u03c3\u0304, noise to residual [-]"),
     "Residual spectrum": ("frequency [Hz]", "power spectrum [{nm²/Hz}]"),
-    "Strehl ratio": ("frequency error [Hz]", "Strehl ratio [%]"),
+    STREHL: ("frequency error [Hz]", "Strehl ratio [%]"),
     "Estimation error": ("frequency [Hz]", "\u03c3\u0304, disturbances to error [{nm}]"),
 }
 # Frequencies of a curve, in all and on each side of a line, and shifts of the true lines: as many
@@ -247,44 +269,45 @@ FIGURES = {
 _POINTS, _NEAR_A_LINE, _SHIFTS = 240, 28, 15
 
 
-def show_design(design: Design, config: Config, start: Config, shift_hz: float) -> Shown:
-    """Return what a design does in the loop of a configuration.
-
-    The true lines have moved there by a shift from where they are at the start, and move on for the
-    Strehl ratio over their shift.
-    """
+def loop_curves(design: Design, config: Config) -> dict[str, Curve]:
+    """Return the curves over frequency of a design in the loop of a configuration."""
     hardware, truth, n = config.hardware, config.truth, config.hardware.modes
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     density = {"points": _POINTS, "near": _NEAR_A_LINE}
     f = frequency_grid(hardware.frame_rate_hz, truth.lines_hz, **density)
-    lines = {name: getattr(start.truth, name) for name in ("vibrations", "frequency_errors_hz")}
-    low, high = frequency_errors(start)[[0, -1]]
-    shifts = np.unique([*np.linspace(low, high, _SHIFTS), shift_hz])
-    image = robustness_map(
-        design,
-        replace(truth, **lines),
-        config.imaging,
-        hardware=hardware,
-        errors_hz=shifts,
-        sensor_gains=[truth.sensor_gain],
-    )
     rejection = noise = power = np.full(f.size, np.nan)
     if loop.is_stable:
         power = shown_unit("nm²/Hz")[1] * exact_spectrum(loop, truth, f, SEGMENT)
         response = loop.system.frequency_response(f)[:, :n]
         rejection, noise = (spectral_norms(response[..., s]) for s in (np.s_[:n], np.s_[n:]))
-    curves = {
-        "Rejection": (f, rejection),
-        "Noise": (f, noise),
-        "Residual spectrum": (f, power),
-        "Strehl ratio": (shifts, 100 * image.strehl[0, 0]),
-    }
+    curves = {"Rejection": (f, rejection), "Noise": (f, noise), "Residual spectrum": (f, power)}
     if design.is_estimator:
         error = spectral_norms(design.error_system().frequency_response(f))
         curves["Estimation error"] = f, shown_unit("nm")[1] * error
+    return curves
+
+
+def with_image(
+    shown: Shown, design: Design, config: Config, start: Config, shift_hz: float
+) -> Shown:
+    """Return what is shown with the residual, the Strehl ratio, and its curve over the shift.
+
+    The true lines have moved by a shift from where they are at the start, and move on.
+    """
+    lines = {name: getattr(start.truth, name) for name in ("vibrations", "frequency_errors_hz")}
+    low, high = frequency_errors(start)[[0, -1]]
+    shifts = np.unique([*np.linspace(low, high, _SHIFTS), shift_hz])
+    image = robustness_map(
+        design,
+        replace(config.truth, **lines),
+        config.imaging,
+        hardware=config.hardware,
+        errors_hz=shifts,
+        sensor_gains=[config.truth.sensor_gain],
+    )
     now = int(np.searchsorted(shifts, shift_hz))
     return Shown(
-        curves=curves,
+        curves={**shown.curves, STREHL: (shifts, 100 * image.strehl[0, 0])},
         residual_nm=float(image.residual_nm[0, 0, now]),
         strehl=float(image.strehl[0, 0, now]),
     )
@@ -374,8 +397,11 @@ def new_panel(title: str) -> tuple[Any, ColumnDataSource, ColumnDataSource]:
     for axis, text in zip((figure.xaxis[0], figure.yaxis[0]), FIGURES[title], strict=True):
         axis.axis_label = PlainText(text=text.format_map(units))
     figure.vspan(x="at", source=rules, line_color=GREY, line_dash="dotted")
-    figure.add_layout(Legend(orientation="horizontal", padding=0, border_line_color=None), "below")
-    look: dict[str, Any] = {"line_color": "colour", "line_dash": "dash", "legend_field": "name"}
+    look: dict[str, Any] = {"line_color": "colour", "line_dash": "dash"}
+    if title == next(iter(FIGURES)):  # the others draw designs alike; a legend takes 2 ms a move
+        legend = Legend(orientation="horizontal", padding=0, border_line_color=None)
+        figure.add_layout(legend, "below")
+        look["legend_field"] = "name"
     lines = figure.multi_line("x", "y", line_width=2, source=curves, **look)
     tips = [("", "@name"), ("x", "$snap_x"), ("y", "$snap_y")]
     figure.add_tools(HoverTool(renderers=[lines], tooltips=tips))
@@ -456,7 +482,21 @@ class Session:
         try:
             self._view = new_view(self._start, self._designs, self._method.value, values)
             self._seconds[self._method.value] = time.perf_counter() - begun
-            self._show()
+            self._show([title for title in FIGURES if title != STREHL])
+        except Exception as error:
+            judges = False
+            self._say(self._verdict, str(error) or repr(error))
+        finish = partial(self._finish, judges=judges)
+        self._document.add_timeout_callback(finish, _TICK_MS)
+
+    def _finish(self, *, judges: bool) -> None:
+        """Show what the designs leave, and say what to think of it, unless a new wish waits."""
+        if self._waits:
+            self._judges |= judges
+            return
+        try:
+            self._view = whole_view(self._view, self._start)
+            self._show([STREHL])
             if judges:
                 self._say(self._verdict, judge(self._view))
         except Exception as error:
@@ -467,12 +507,15 @@ class Session:
         """Write lines of plain text."""
         place.update(text="\n".join(lines), disable_math=True, render_as_text=True)
 
-    def _show(self) -> None:
+    def _show(self, titles: Collection[str] = FIGURES) -> None:
         """Show the view and what was kept, each design in the look of its place."""
         view, shown = self._view, {**self._view.shown, **self._kept}
-        for title, (_, curves, rules) in self._panels.items():
+        for title in titles:
+            _, curves, rules = self._panels[title]
             over_frequency = FIGURES[title][0] == "frequency [Hz]"
-            rules.data = {"at": np.array(view.config.truth.lines_hz if over_frequency else [])}
+            lines_hz = view.config.truth.lines_hz if over_frequency else []
+            if list(rules.data["at"]) != lines_hz:
+                rules.data = {"at": np.array(lines_hz)}
             drawn = {
                 name: (look, *one.curves[title])
                 for look, (name, one) in enumerate(shown.items())
@@ -485,11 +528,12 @@ class Session:
                 "colour": [colour(look) for look, *_ in drawn.values()],
                 "dash": [dashes(look) for look, *_ in drawn.values()],
             }
-        self._table.text = "\n".join(text_lines(explored_table(shown), 100))
+        if STREHL in titles:
+            self._table.text = "\n".join(text_lines(explored_table(shown), 100))
 
     def _keep(self) -> None:
         """Keep the curves of the design that is shown."""
-        view = self._view
+        self._view = view = whole_view(self._view, self._start)
         self._kept[f"{view.name}, {view.moves or 'kept'}"] = view.shown[view.name]
         self._show()
 
@@ -538,7 +582,7 @@ def serve(
     """
     for name, design in designs.items():
         require_compatible(name, design, start.hardware)
-    first, saved = new_view(start, designs), list[Path]()
+    first, saved = whole_view(new_view(start, designs), start), list[Path]()
     names = dict.fromkeys(("0.0.0.0", "::"), socket.gethostname()) | {"::1": "localhost"}
     name, place = names.get(host, host), port
     try:

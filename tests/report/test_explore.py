@@ -25,7 +25,7 @@ from lbt_synth.report.explore import (
     move,
     new_view,
     save_view,
-    show_design,
+    whole_view,
 )
 from lbt_synth.report.figures.records import exact_spectrum
 from lbt_synth.storage.display_unit import own_display_unit, show_in
@@ -43,7 +43,7 @@ def old(start):
 
 @pytest.fixture(scope="module")
 def first(start, old):
-    return new_view(start, old)
+    return whole_view(new_view(start, old), start)
 
 
 def test_a_view_begins_with_its_own_design(start, first):
@@ -96,8 +96,8 @@ def test_curves_are_those_of_the_loop(start, first):
 
 def test_performance_is_that_of_the_budget(start, first):
     shift = 1.3
-    config = move(start, {"shift": shift, "gain": 0.8})
-    shown = show_design(first.design, config, start, shift)
+    view = whole_view(new_view(start, {}, "", {"shift": shift, "gain": 0.8}), start)
+    shown, config = view.shown["Kalman"], view.config
     loop = lbt.close_loop(config.hardware, first.design.controller, sensor_gain=0.8)
     budget = lbt.residual_budget(loop, config.truth)
     assert shown.residual_nm == pytest.approx(budget.rms_nm, rel=1e-6)
@@ -109,8 +109,8 @@ def test_performance_is_that_of_the_budget(start, first):
     assert (shifts[0], shifts[-1]) == (-3.5, 3.5)
 
 
-def test_an_unstable_loop_has_no_numbers(start, first):
-    shown = show_design(first.design, move(start, {"gain": 2.4}), start, 0.0)
+def test_an_unstable_loop_has_no_numbers(start):
+    shown = whole_view(new_view(start, {}, "", {"gain": 2.4}), start).shown["Kalman"]
     titles = ("Rejection", "Noise", "Residual spectrum", "Strehl ratio")
     curves = [shown.curves[title][1] for title in titles]
     assert np.isnan([shown.residual_nm, shown.strehl, *np.concatenate(curves)]).all()
@@ -277,6 +277,31 @@ def test_a_slider_that_moves_is_a_new_design(page):
     assert f"leaves {residual} nm rms" in said
     assert page.session._view.config.hardware.delay_frames == 3.0
     assert len(set(curves.data["colour"])) == len(set(map(tuple, curves.data["dash"]))) == 2
+
+
+def test_strehl_ratios_and_the_table_come_last_unless_the_slider_moves_on(page):
+    def shown():
+        data = [page[name].renderers[-1].data_source.data["y"][0] for name in FIGURES]
+        return [page["table"].text, *(str(values.tolist()) for values in data)]
+
+    states = [shown()]
+    for delay in (2.5, 3.0):  # the first is left before it is whole
+        page["delay"].value = delay
+        page.session._design()
+        states.append(shown())
+        page.release("delay")
+        page.session._finish(judges=False)
+        states.append(shown())
+    last = [list(FIGURES).index("Strehl ratio") + 1, 0]
+    for before, after in ((0, 1), (2, 3)):
+        same = [i for i, old in enumerate(states[before]) if old == states[after][i]]
+        assert same == sorted(last)
+    assert states[1] == states[2]
+    assert page.settle().startswith("Kalman leaves")
+    page["gain"].value = 0.8
+    page.session._keep()
+    assert page.settle() == "Designing …"
+    assert len(page.names()) == 3
 
 
 def test_a_slow_method_waits_for_the_release_and_an_error_is_said(page, monkeypatch):

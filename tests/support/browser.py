@@ -8,8 +8,11 @@ PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
 DESK = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
 
 
-def chromium(profile, *hosts):
-    """Start headless Chromium, to which no names are known but those of hosts."""
+def chromium(profile, *hosts, logs=True):
+    """Start headless Chromium, to which no names are known but those of hosts.
+
+    Its logs take time from whatever is measured.
+    """
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -17,7 +20,8 @@ def chromium(profile, *hosts):
     rules = ", ".join(["MAP * ~NOTFOUND", *(f"EXCLUDE {host}" for host in hosts)])
     for option in (*OPTIONS, f"--host-resolver-rules={rules}", f"--user-data-dir={profile}"):
         options.add_argument(option)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    if logs:
+        options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     service = webdriver.ChromeService(executable_path="/usr/bin/chromedriver")
     return webdriver.Chrome(options=options, service=service)
 
