@@ -4,6 +4,7 @@
     python benchmarks/identification.py --errors    only how honest the standard errors are
     python benchmarks/identification.py --errors --colour 0.3 ...    with first-order noise
     python benchmarks/identification.py --errors --close ...         with pairs of close lines
+    python benchmarks/identification.py --errors --wide 2 ...        with two wide resonances
 
 One axis at 1 kHz with a delay of 2 frames, an integrator of gain 0.2 to 0.6, sensor gain 0.4 to
 1, noise 2 to 30 nm a frame (evenly in its logarithm). Even records: second-order turbulence of
@@ -60,11 +61,12 @@ def case(
     drift: lbt.models.ARModel | None = None,
     colour: float = 0.0,
     close: bool = False,
+    wide: int = 0,
 ) -> Case:
     """Draw a loop, perhaps with a drift on top of its turbulence, and run it.
 
     ``colour`` is the correlation of the noise of neighbouring frames; ``close`` puts a second line
-    within 4 half widths of each.
+    within 4 half widths of each, and ``wide`` is how many resonances have a damping of 0.05 to 0.2.
     """
     rng = np.random.default_rng([seed, 1])
     path = lbt.LoopHardware(frame_rate_hz=rate, delay_frames=2, modes=1)
@@ -88,6 +90,7 @@ def case(
             )
             for line in lines
         )
+    lines += tuple(random_line(rng, (1.0,), damping=(0.05, 0.2)) for _ in range(wide))
     total = turbulence if drift is None else lbt.models.SumSpectrum(parts=[turbulence, drift])
     truth = lbt.Truth(turbulence=total, vibrations=lines, noise_nm=noise, sensor_gain=sensor_gain)
     gain = float(rng.uniform(0.2, 0.6))
@@ -341,17 +344,13 @@ def table(results: list[dict]) -> None:
     print(f"lines above twice their background         {total}")
     print(f"found within {NEAR_HZ:g} Hz                       {100 * len(found) / total:.1f} %")
     print(f"false lines a record                       {len(false) / len(results):.3f}")
+    line, away = "record {} {:.2f} Hz, damping {:.4f}, {:.1f} nm,", "nearest {:.3f} Hz away,"
     for facts in missed:
         print(
-            "  missed: record {} {:.2f} Hz, damping {:.4f}, {:.1f} nm, {:.3g} x background; "
-            "nearest {:.3f} Hz away, least error {:.3f} Hz".format(*facts)
+            f"  missed: {line} {{:.3g}} x background; {away} least error {{:.3f}} Hz".format(*facts)
         )
     for facts in false:
-        print(
-            "  false: record {} {:.2f} Hz, damping {:.4f}, {:.1f} nm, evidence {:.1f}".format(
-                *facts
-            )
-        )
+        print(f"  false: {line} evidence {{:.1f}}".format(*facts))
     coverage(results)
     groups = {"all": results}
     groups["second-order turbulence"] = [r for r in results if not r["frozen"]]
@@ -391,12 +390,12 @@ def table(results: list[dict]) -> None:
 def main() -> None:
     """Run the study."""
     asked = record_options(
-        __doc__, records=200, jobs=2, seconds=60.0, errors=False, colour=0.0, close=False
+        __doc__, records=200, jobs=2, seconds=60.0, errors=False, colour=0.0, close=False, wide=0
     )
     study, show, options = studied, table, {}
     if asked.errors:
         study, show = only_errors, show_errors
-        options = {"colour": asked.colour, "close": asked.close}
+        options = {name: getattr(asked, name) for name in ("colour", "close", "wide")}
     show(run_all(partial(study, frames=int(asked.seconds * RATE), **options), asked))
 
 

@@ -34,10 +34,7 @@ def main() -> None:
     known = {"hardware": path, "noise_nm": noise}
     optimised = lbt.design.modal.modal_gains(modes, **known)
     filters = lbt.design.modal.modal_filters(modes, **known)
-    rows = {
-        "integrators, optimised gains": optimised.rms_nm,
-        "Kalman filters": filters.rms_nm,
-    }
+    rows = {"integrators, optimised gains": optimised.rms_nm, "Kalman filters": filters.rms_nm}
     print(
         f"{'residual [nm rms], AR1 turbulence':36s} {'all':>7s} {'n = 1':>7s} "
         f"{'2 to 9':>7s} {'10 to 36':>8s}"
