@@ -167,6 +167,7 @@ def prediction_against_data(
     require_instance(plant, TipTiltPlant)
     if imaging is not None:
         require_instance(imaging, Imaging)
+    plant.require_own_sensor("a replay of a record")
     hardware, runs = plant.hardware, record.stretches()
     if (hardware.modes, hardware.frame_rate_hz) != (record.axes, record.frame_rate_hz):
         raise ProblemError(

@@ -186,7 +186,7 @@ class TipTiltPlant(EstimationProblem):
             others = ", ".join(self.hardware.suite.units[1:])
             raise ProblemError(
                 f"{what} reads the loop's own sensor alone; got a plant that {others} see, too. "
-                "Take plant.own_sensor_alone(), or kalman, hinf or mixed, which read all."
+                "Take plant.own_sensor_alone(); kalman, hinf and mixed read all."
             )
 
     def own_sensor_alone(self) -> TipTiltPlant:

@@ -27,6 +27,7 @@ from support.predictions import (
     replayed_residual,
 )
 from support.refusals import require_refusals
+from support.sensor_loops import example_plant
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
@@ -391,6 +392,7 @@ def test_what_cannot_be_compared_is_refused():
         (partial(make_table, running=INTEGRATOR), "what ran needs commands"),
         (partial(make_table, imaging=2.2), "expected an Imaging"),
         (partial(make_table, plant=PATH), "expected a TipTiltPlant"),
+        (partial(make_table, plant=example_plant()), "reads the loop's own sensor alone"),
         (partial(make_table, plant=a_plant(sensor=[[1, 0], [1, 0]])), "inverted; .* of rank 1"),
         (lambda: make_table()["mine"], "the table has the rows best integrator, .*'mine'"),
     ]
