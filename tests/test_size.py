@@ -18,10 +18,10 @@ LINES = {
     "config": 1622,
     "design": 5985,
     "files": 1252,
-    "identification": 8874,
+    "identification": 8875,
     "interop": 3687,
     "linear": 4756,
-    "loop": 3961,
+    "loop": 3964,
     "methods": 784,
     "models": 3753,
     "report": 3324,
@@ -33,9 +33,9 @@ COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 24719,
+    "lines of tests": 24725,
     "lines of benchmarks": 3998,
-    "words of docs": 59983,
+    "words of docs": 59995,
 }
 
 
