@@ -15,8 +15,8 @@ from lbt_synth.cli.loop_inputs import difference_notes, load_designs, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.telemetry import write_telemetry
 from lbt_synth.config import Config
-from lbt_synth.design import Design
-from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
+from lbt_synth.design import Design, integrator
+from lbt_synth.errors import GainFileError, LbtSynthError, ProblemError, UnstableLoopError
 from lbt_synth.files import telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.loop import ClosedLoop
@@ -30,6 +30,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.words import count_text
+from lbt_synth.studies.limits import limits
 from lbt_synth.studies.runs import DesignRun, run_design
 
 _TIME = r"(\d+\.?\d*)s?"
@@ -139,6 +140,7 @@ def _describe_runs(runs: Sequence[DesignRun], truth: Truth, config: Config) -> R
         if row.residual_exact_nm is not None:
             said += f", and {nm_text(row.residual_exact_nm, '.1f')} without chance"
         report.verdict.append(f"{said}.")
+    report.verdict += _say_references(truth, config)
     caption = f"{count_text(cases, 'run')} of {frames} frames; {config.imaging.label}"
     report.add_rows("designs", caption, rows)
     report.rows, report.without = rows, ("cases_residual_nm", "cases_strehl")
@@ -152,6 +154,21 @@ def _describe_runs(runs: Sequence[DesignRun], truth: Truth, config: Config) -> R
             "note: a vibration drifts, so there is no exact answer beside the simulation."
         )
     return report
+
+
+def _say_references(truth: Truth, config: Config) -> list[str]:
+    """Say what the best controllers of the loop's own sensor leave, if there are any."""
+    alone = config.hardware.own_sensor_alone()
+    try:
+        study = limits({"": integrator(alone, truth=truth)}, alone, truth, config.imaging)
+    except LbtSynthError:
+        return []
+    said = f"The best integrator leaves {nm_text(study.rows[0].residual_nm, '.1f')}"
+    if study.limit is not None:
+        said += f", the best linear controller {nm_text(study.limit.rms_nm, '.1f')}"
+    if config.hardware.suite.sensors:
+        said += ", both by the loop's own sensor alone"
+    return [f"{said}."]
 
 
 def _draw(design: Design, simulation: Simulation, segments: Sequence[tuple[Segment, Facts]]) -> Any:
