@@ -113,9 +113,9 @@ def run_limits(arguments: Namespace) -> Report:
             "band_achieved_nm": study.band.achieved_nm,
         }
         report.verdict.append(
-            f"With the vibration anywhere from {low:g} to {high:g} Hz, the least worst residual is "
-            f"{nm_text(study.band.rms_nm, '.6g', unit='nm rms')} (a filter of infinite order "
-            f"achieves {nm_text(study.band.achieved_nm, '.6g')})."
+            f"With the vibration anywhere from {low:g} to {high:g} Hz, no controller has a worst "
+            f"residual below {nm_text(study.band.rms_nm, '.6g', unit='nm rms')}; a filter of "
+            f"infinite order achieves {nm_text(study.band.achieved_nm, '.6g')}."
         )
     if study.limit is not None:
         report.notes.append(loop_inputs.say_limit(study.limit, config))

@@ -183,9 +183,8 @@ def compare_in_truth(
     """Compare designs in the stationary truth of a configuration with its reference designs.
 
     These are the integrator of least residual, the Kalman filter and the H-infinity filter; some
-    methods are left out, and so is one that leaves the same as a design. Warnings say what is wrong
-    with a design in this truth: an unstable loop, a residual far above what the design expects, and
-    demands that cost residual.
+    methods are left out, and so is one that leaves the same as a design. Warnings are of an unstable
+    loop, of a residual far above what the design expects, and of demands that cost residual.
     """
     references: dict[str, Design] = {}
     notes = []

@@ -40,7 +40,7 @@ def test_limits_command(tmp_path, capsys, gains):
     limits = {"limit_nm": 37.7777, "band_limit_nm": 43.8561}
     assert {name: data[name] for name in limits} == pytest.approx(limits, abs=1e-4)
     assert data["band_hz"] == [16.5, 23.5]
-    assert "least worst residual is 43.8561 nm rms" in data["verdict"][-1]
+    assert "no controller has a worst residual below 43.8561 nm rms" in data["verdict"][-1]
     rows = {row["design"]: row for row in data["rows"]}
     assert list(rows) == ["integrator", "kalman", "hinf", "kalman (file)"]
     assert rows["kalman"]["residual_nm"] == pytest.approx(rows["kalman (file)"]["residual_nm"])
