@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3204,
+    "cli": 3208,
     "config": 1622,
     "design": 5985,
     "files": 1252,
@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 24738,
+    "lines of tests": 24740,
     "lines of benchmarks": 3998,
     "words of docs": 60007,
 }
