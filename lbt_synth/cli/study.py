@@ -107,8 +107,7 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             *(f"warning: failed: {name}: {error}" for _, name, error in replay.failures),
         ],
     )
-    results = [(name, stored.get(name), fresh.get(name)) for name in loaded.result_columns]
-    report.add_table(f"Results of row {row}", ("result", "stored", "now"), results)
+    report.tables.append(replay.table(row, loaded.result_columns))
     report.note_written(*replay.files)
     return report
 
