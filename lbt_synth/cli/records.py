@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from lbt_synth import identification, studies
 from lbt_synth.cli.arguments import input_files, refuse_options
-from lbt_synth.cli.loop_inputs import add_certificate, choose_unit, load_designs, say_accelerometers
+from lbt_synth.cli.loop_inputs import add_certificate, keep_unit, load_designs, say_accelerometers
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, printable
 from lbt_synth.cli.telemetry import load_series, record_imaging, record_telescope, require_series
@@ -32,13 +32,14 @@ from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
-from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.words import count_text
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
     from lbt_synth.design import Design
     from lbt_synth.identification.auto import RecordedDesign
+    from lbt_synth.identification.prediction.comparison import PredictionRow
 
 
 _STEPS = 3  # that diagnose and auto count
@@ -52,7 +53,6 @@ def run_identify(arguments: Namespace) -> Report:
     if isinstance(record, LoopRecord):
         record = record.bridged()
         require_length(record)
-    choose_unit(arguments, record.diameter_m)
     readings = read_accelerations(arguments, record)
     options = identification_options(arguments, record)
     doubts = judge_record(arguments, record)
@@ -99,7 +99,6 @@ def run_auto(arguments: Namespace) -> Report:
         return _run_nights(arguments, gain)
     places = find_places(arguments, gain=gain)
     record = require_series(load_series(arguments), _TESTED).bridged()
-    choose_unit(arguments, record.diameter_m)
     channels, values, notes = read_accelerations(arguments, record) or (None, None, ())
     imaging = record_imaging(arguments, record)
     with count_progress(total=_STEPS, what="identifying and designing") as count:
@@ -134,7 +133,6 @@ def run_auto(arguments: Namespace) -> Report:
     loop = design.close(made.model.hardware)
     add_certificate(report, design)
     report.verdict.append(f"The loop has a modulus margin of {loop_margins(loop).modulus:.3f}.")
-    report.note_written(save_gain(gain, design))
     write_files(report, places, arguments, record, made.model, designs={made.name: design})
     return report
 
@@ -167,7 +165,6 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
             lowest_line_hz=arguments.lowest_line_hz,
             most_lines=arguments.most_lines,
         )
-    choose_unit(arguments, nights[names[0]].diameter_m)
     design = _with_repairs(made.design, *nights.values())
     report = Report(
         data={"sources": arguments.files, "written": made.name, "method": design.method},
@@ -185,7 +182,7 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
     ]
     report.add_rows("nights", "Residual by the model of each night", rows)
     add_certificate(report, design)
-    report.note_written(save_gain(gain, design))
+    report.note_written(save_gain(gain, keep_unit(design, nights[names[-1]].diameter_m)))
     return report
 
 
@@ -197,11 +194,10 @@ def _say_held_out(
 
     best, name = made.held_out[made.name], made.name
     report.data |= {"gain_over_what_ran": None, "wavelength_um": imaging.wavelength_um}
-    after = nm_text(best.replayed_nm, ".1f")
-    said = f"The {name} leaves {after} rms on unseen data"
+    said = f"The {name} leaves {_rms_text(best, ' rms')} on unseen data"
     if record.commands is not None:
         ran = made.held_out[RAN]
-        said += f", where what ran left {nm_text(ran.replayed_nm, '.1f')}"
+        said += f", where what ran left {_rms_text(ran)}"
         if ran.strehl >= 0 and best.strehl >= 0:
             said += f"; {imaging.label} (tip and tilt) {ran.strehl:.3f} -> {best.strehl:.3f}"
         report.data["gain_over_what_ran"] = {
@@ -221,6 +217,13 @@ def _say_held_out(
     report.notes += [marked_note(note) for note in made.notes]
 
 
+def _rms_text(row: PredictionRow, unit: str = "") -> str:
+    """Return the residual of a row on the data, or its bound where the noise hides it."""
+    if row.replayed is not None and row.replayed.hidden:
+        return row.replayed.text
+    return nm_text(row.replayed_nm, ".1f") + unit
+
+
 def run_diagnose(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
     from lbt_synth.identification.diagnosis import (  # with it come the methods
@@ -236,7 +239,6 @@ def run_diagnose(arguments: Namespace) -> Report:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
     designs = {} if arguments.gain is None else load_designs([arguments.gain])
     both = require_series(load_series(arguments), _EXAMINES)
-    choose_unit(arguments, both.diameter_m)
     live = live_axes(both)
     some = len(live) not in (0, both.axes)
     record = require_series(load_series(arguments, live), _EXAMINES) if some else both
@@ -346,6 +348,9 @@ def find_places(arguments: Namespace, **gain: Path) -> dict[str, Path]:
     if not arguments.no_figure:
         places["figure"] = output.with_suffix(".png")
     require_writable(*places.values(), inputs=input_files(arguments))
+    for path in places.values():  # of the same output, files are replaced
+        if path.exists() and not output.exists():
+            raise ProblemError(f"{path} would be replaced; give -o another name than {output}.")
     return places
 
 
@@ -359,15 +364,19 @@ def write_files(
     designs: Mapping[str, Design] | None = None,
     accelerometers: AccelerometerTransfers | None = None,
 ) -> None:
-    """Write model and figure, one after the other: what is ready is not lost."""
+    """Write gain file, model and figure, one after the other: what is ready is not lost."""
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
         **record_telescope(arguments, record),
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
         accelerometers=accelerometers,
+        units=shown_unit("nm")[0],
     )
     text = config_text(settings, comments).encode()
+    for design in (designs or {}).values():
+        kept = keep_unit(design, record.diameter_m)
+        report.note_written(save_gain(places["gain"], kept))
     report.note_written(write_atomically(places["model"], text))
     report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
     if "figure" in places:

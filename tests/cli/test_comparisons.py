@@ -140,6 +140,8 @@ def test_a_map_is_of_the_loop_of_the_configuration(tmp_path, capsys):
     said = " ".join(run_done(capsys, *words, *few).split())
     assert said.startswith("half is unstable at 8 of 9 pairs of a sensor gain and a delay error")
     assert "note: designed for a delay of 2 frames, run with 2.4 (half)." in said
+    beyond = write_config(tmp_path, LBT.replace("  sensor_gain: 1.0 ", "  sensor_gain: 2.0 "))
+    assert "At a sensor gain of 2: Strehl" in run_done(capsys, "robustness", beyond, gain)
 
 
 def test_compare(tmp_path, capsys, gains, config):

@@ -128,6 +128,8 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night):
     assert data["files"] == [str(out.with_suffix(ending)) for ending in (".fits", ".yaml", ".png")]
     assert lbt.load_config(data["files"][1]).plant.vibrations
     assert out.with_suffix(".png").is_file()
+    out.unlink()  # the model may be another's now
+    assert "tt.yaml would be replaced" in run(capsys, "auto", recorded_night, "-o", out)[2]
 
 
 def test_an_open_loop_series_and_one_axis(tmp_path, capsys):
@@ -140,6 +142,15 @@ def test_an_open_loop_series_and_one_axis(tmp_path, capsys):
     assert "note: the Kalman filter stays: " in text
     assert lbt.load_config(tmp_path / "t.yaml").plant.hardware.modes == 1
     assert not (tmp_path / "t.png").exists()
+
+
+def test_a_residual_that_the_noise_hides_has_a_bound(tmp_path, capsys):
+    np.save(tmp_path / "noise.npy", 300 * np.random.default_rng(1).standard_normal(5000))
+    words = ("--columns", "open_loop=0", "--no-figure", "-o", tmp_path / "t.fits", *FACTS)
+    data = run_json(capsys, "auto", tmp_path / "noise.npy", *words)
+    (row,) = (row for row in data["held_out"] if row["name"] == "Kalman filter")
+    assert row["data_nm"] is row["strehl"] is None
+    assert "leaves at most 76 nm (the noise hides it) on unseen data." in data["verdict"][0]
 
 
 def test_several_nights_make_one_design_and_a_table(tmp_path, capsys) -> None:

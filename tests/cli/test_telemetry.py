@@ -1,6 +1,7 @@
 """The command telemetry, and the telemetry of simulate."""
 
 import hashlib
+import re
 import sys
 
 import numpy as np
@@ -101,6 +102,21 @@ def test_a_record_is_read_once(tmp_path, capsys):
     assert read in run_json(capsys, *words)["assumptions"][0]
     assert "The record is sound" in run_done(capsys, "diagnose", night)
     assert options in run_done(capsys, "telemetry", "--verbose", night)
+    assert "\nunits: mas\n" in (tmp_path / "b.yaml").read_text()
+    gain, other = tmp_path / "b.fits", tmp_path / "c.fits"
+    run_done(capsys, "design", tmp_path / "b.yaml", "--method", "kalman", "-o", other)
+    shown = [("show", gain), ("show", other), ("plot", "step", gain), ("diagnose", night, gain)]
+    for words in (
+        *shown,
+        ("rehearse", night, gain, "--for", "c"),
+    ):  # in mas, unless nm is asked for
+        option = "--unit" if words[0] in ("show", "plot") else "--show-unit"
+        assert not re.search(r"\bnm\b", run_done(capsys, *words, "--verbose")), words
+        in_nm = run_done(capsys, *words, option, "nm", "--verbose")
+        assert re.search(r"\bnm\b", in_nm) or words[0] == "plot", words
+    assert re.search(
+        r"commands +6000 x 2 +frame, command +mas ", run_done(capsys, "telemetry", night)
+    )
 
 
 def test_an_open_loop_is_read_once(tmp_path, capsys):
