@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3177,
+    "cli": 3206,
     "config": 1622,
     "design": 5985,
     "files": 1252,
@@ -24,18 +24,18 @@ LINES = {
     "loop": 3964,
     "methods": 784,
     "models": 3753,
-    "report": 3324,
+    "report": 3332,
     "storage": 1125,
-    "studies": 3199,
+    "studies": 3200,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 24725,
+    "lines of tests": 24740,
     "lines of benchmarks": 3998,
-    "words of docs": 59995,
+    "words of docs": 59998,
 }
 
 

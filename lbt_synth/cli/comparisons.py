@@ -113,9 +113,9 @@ def run_limits(arguments: Namespace) -> Report:
             "band_achieved_nm": study.band.achieved_nm,
         }
         report.verdict.append(
-            f"With the vibration anywhere from {low:g} to {high:g} Hz, the least worst residual is "
-            f"{nm_text(study.band.rms_nm, '.6g', unit='nm rms')} (a filter of infinite order "
-            f"achieves {nm_text(study.band.achieved_nm, '.6g')})."
+            f"With the vibration anywhere from {low:g} to {high:g} Hz, no controller has a worst "
+            f"residual below {nm_text(study.band.rms_nm, '.6g', unit='nm rms')}; a filter of "
+            f"infinite order achieves {nm_text(study.band.achieved_nm, '.6g')}."
         )
     if study.limit is not None:
         report.notes.append(loop_inputs.say_limit(study.limit, config))
@@ -241,6 +241,9 @@ def run_robustness(arguments: Namespace) -> Report:
     settings, hardware = config.settings.robustness, config.hardware
     errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(config.errors_hz))
     gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
+    true_gain = config.sensor_gain * config.truth.sensor_gain
+    if arguments.sensor_gains is None and not np.isclose(gains, true_gain).any():
+        gains = np.union1d(gains, true_gain)
     delays = arguments.delay_errors_frames or settings.delay_errors_frames
     for gain in gains:
         number(gain, "--sensor-gains", above=0)
@@ -258,7 +261,7 @@ def run_robustness(arguments: Namespace) -> Report:
             hardware=hardware,
         )
         maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
-    real = int(np.argmin(np.abs(gains - config.sensor_gain * config.truth.sensor_gain)))
+    real = int(np.argmin(np.abs(gains - true_gain)))
     lines = [line for name, grid in maps.items() for line in grid.worst_points(name, real)]
     where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
     caption = f"At a sensor gain of {gains[real]:.3g}: {config.imaging.label}, over {where}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from contextlib import suppress
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +89,10 @@ def _say_model(design: Design) -> str:
     title = f"The {design_title(design.method)}"
     if design.plant is None and (bought := say_accelerometers(design)):
         return f"{title} leaves {bought}, on unseen frames of its record."
-    if (residual_nm := design.expected_residual_nm) is not None:
-        return f"{title} leaves {nm_text(residual_nm, '.1f')} rms in its model."
+    residual_nm = design.derived().get("residual_nm", design.expected_residual_nm)
+    if residual_nm is not None and isfinite(residual_nm):
+        place = "on unseen frames of its record" if design.plant is None else "in its model"
+        return f"{title} leaves {nm_text(residual_nm, '.1f')} rms {place}."
     if design.is_estimator:
         return f"{title} leaves an estimation error of {design.rms:.6g} rms in its model."
     return f"{title} has {design.controller.n_states} states."

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 import signal
 import sys
@@ -130,8 +131,10 @@ def _terminate(*_: object) -> None:
 
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
-    for stream in (sys.stdout, sys.stderr):  # no character that an encoding lacks ends a command
-        stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    for name in ("stdout", "stderr"):  # no character that an encoding lacks ends a command
+        stream = getattr(sys, name) or os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")  # if closed
+        stream.reconfigure(errors="backslashreplace")
+        setattr(sys, name, stream)
     try:
         try:
             with limit_threads():  # numpy is loaded by the commands

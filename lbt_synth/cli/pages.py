@@ -44,8 +44,6 @@ def run_plot(arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     choose_design_unit(arguments, dict(zip(arguments.gains, designs.values(), strict=True)))
     report = Report(figure=lambda: loop_figure(designs, view, sensor_gain=gain))
-    if view == "step":
-        _add_step_facts(report, designs, gain)
     _add_margins(report, designs, gain)
     with own_display_unit():  # JSON and CSV stay in nm
         curves = list(figure_series(loop_figure(designs, view, sensor_gain=gain)))
@@ -54,6 +52,9 @@ def run_plot(arguments: Namespace) -> Report:
             f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
             "there is nothing to draw; lbt-synth show prints the factors that are stable."
         )
+    if view == "step":
+        _add_step_facts(report, designs, gain)
+        report.tables.reverse()
     report.rows = [
         facts(
             panel=fact(c.panel), curve=fact(c.name), heading=fact(c.heading), x=fact(x), y=fact(y)

@@ -131,7 +131,6 @@ def run_auto(arguments: Namespace) -> Report:
     loop = design.close(made.model.hardware)
     add_certificate(report, design)
     report.verdict.append(f"The loop has a modulus margin of {loop_margins(loop).modulus:.3f}.")
-    report.note_written(save_gain(gain, keep_unit(design, record.diameter_m)))
     write_files(report, places, arguments, record, made.model, designs={made.name: design})
     return report
 
@@ -340,6 +339,9 @@ def find_places(arguments: Namespace, **gain: Path) -> dict[str, Path]:
     if not arguments.no_figure:
         places["figure"] = output.with_suffix(".png")
     require_writable(*places.values(), inputs=input_files(arguments))
+    for path in places.values():  # of the same output, files are replaced
+        if path.exists() and not output.exists():
+            raise ProblemError(f"{path} would be replaced; give -o another name than {output}.")
     return places
 
 
@@ -353,7 +355,7 @@ def write_files(
     designs: Mapping[str, Design] | None = None,
     accelerometers: AccelerometerTransfers | None = None,
 ) -> None:
-    """Write model and figure, one after the other: what is ready is not lost."""
+    """Write gain file, model and figure, one after the other: what is ready is not lost."""
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
@@ -363,6 +365,8 @@ def write_files(
         units=shown_unit("nm")[0],
     )
     text = config_text(settings, comments).encode()
+    for design in (designs or {}).values():
+        report.note_written(save_gain(places["gain"], keep_unit(design, record.diameter_m)))
     report.note_written(write_atomically(places["model"], text))
     report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
     if "figure" in places:

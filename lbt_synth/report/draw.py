@@ -222,6 +222,8 @@ def draw_map(
             panel.fill_between([], [], [], label=blank, **_BLANK)
     place = {"location": "bottom", "shrink": 0.6, "aspect": 40}
     bar = panels[0].figure.colorbar(mesh, ax=list(panels), **place)
+    bar.ax.xaxis.set_major_formatter("{x:g}")
+    bar.ax.xaxis.minorticks_off()
     bar.set_label(label)
     bar.outline.set_visible(False)
 

@@ -331,14 +331,13 @@ def judge(view: View) -> str:
     config = view.config
     compared = compare_in_truth({view.name: view.design}, config)
     row, *others = compared.rows
-    checks = f"Certified: {count_text(len(view.design.certificate.checks), 'check')} passed."
     gain = config.truth.sensor_gain
     if not row.stable:
         ends = stable_sensor_gains(config.hardware, view.design.controller)
         low, high, real = (f"{config.sensor_gain * factor:.4g}" for factor in (*ends, gain))
         return (
             f"{view.name} is stable at sensor gains of {low} to {high}; at {real} this loop is "
-            f"UNSTABLE. {checks}"
+            "UNSTABLE."
         )
     margins = loop_margins(close_loop(config.hardware, view.design.controller, sensor_gain=gain))
     sentences = [f"WARNING: {fragility}" for fragility in margins.fragilities]
@@ -346,6 +345,7 @@ def judge(view: View) -> str:
     best = min(others, key=lambda other: other.residual_nm, default=row)
     if best.residual_nm < row.residual_nm:
         sentences.append(say_residual(f"Here {best.design}", best, None))
+    checks = f"Certified: {count_text(len(view.design.certificate.checks), 'check')} passed."
     warnings = (f"{text[0].upper()}{text[1:]}." for text in compared.warnings[view.name])
     return " ".join([*sentences, f"It {margins.survival}", *warnings, checks])
 

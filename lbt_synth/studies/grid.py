@@ -1,9 +1,8 @@
 """A grid of many samples: a function of some of them, an executor, and parts on disk.
 
 What a loop leaves has the same columns for one loop and for a stack of them. Answers that fit on a
-page are kept in memory (:func:`evaluate`). A part of a :class:`Sweep` holds the results of a fixed
-number of consecutive rows in a file that is named by them, and a sweep that was killed at any
-moment goes on with the rows that no part has.
+page are kept in memory (:func:`evaluate`). A part of a :class:`Sweep` is a file of the results of
+consecutive rows; a sweep that was killed goes on with the rows that no part has.
 """
 
 from __future__ import annotations
@@ -81,7 +80,10 @@ def evaluate(
         running += [executor.submit(function, *sample) for sample in samples]
         for future in running:
             yield future.result()
-    except (futures.BrokenExecutor, futures.CancelledError) as error:
+    except Exception as error:
+        dead = isinstance(error, futures.BrokenExecutor | futures.CancelledError)
+        if not dead and type(error).__name__ != "KilledWorker":  # that of Dask
+            raise
         died = f"a worker of the executor died ({type(error).__name__}), perhaps out of memory"
         raise NumericalError(f"{died}. Start it again, perhaps with fewer workers.") from error
     finally:

@@ -127,9 +127,9 @@ def _limit_row(
         curve = np.sqrt(residual_nm**2 - first + np.array(others))
     worst_nm = float(np.max(curve)) if shifts.size else residual_nm
     margin_deg, (limit_nm, band_nm) = np.nan, bounds_nm
-    if loop.reads_others:  # the limits are those of the loop's own sensor
+    if hardware.suite.sensors:  # the limits are those of the loop's own sensor
         limit_nm = band_nm = np.nan
-    elif loop.is_stable:
+    if loop.is_stable and not loop.reads_others:
         margin_deg = phase_margin_deg(loop)
     above, above_band = above_percent(residual_nm, limit_nm), above_percent(worst_nm, band_nm)
     rms, over = {"unit": "nm", "format": ".2f"}, {"unit": "%", "format": ".2f"}
@@ -183,9 +183,8 @@ def compare_in_truth(
     """Compare designs in the stationary truth of a configuration with its reference designs.
 
     These are the integrator of least residual, the Kalman filter and the H-infinity filter; some
-    methods are left out, and so is one that leaves the same as a design. Warnings say what is wrong
-    with a design in this truth: an unstable loop, a residual far above what the design expects, and
-    demands that cost residual.
+    methods are left out, and so is one that leaves the same as a design. Warnings are of unstable
+    loops, of a residual far above what the design expects, and of demands that cost residual.
     """
     references: dict[str, Design] = {}
     notes = []

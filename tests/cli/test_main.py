@@ -77,6 +77,7 @@ FAILED = {
     "design CONFIG --method hinf --gamma 1 -o k.fits": "at least 155.* Try --gamma-ratio 1.2.",
     "simulate CONFIG HINF --sensor-gain 0.3": "the closed loop must be stable",
     "plot bode INTEGRATOR --gain-factor 3 -o b.csv": "no loop is stable at 3 times the sensor gain",
+    "plot step INTEGRATOR --gain-factor 3 -o b.csv": "no loop is stable at 3 times the sensor gain",
 }
 WRONG = {
     "design CONFIG --method kalman --gamma 200 -o k.fits": "gamma goes with method hinf",

@@ -151,7 +151,7 @@ SCREEN = {  # words and what a command says of its point, in the unit of the con
     "compare lbt.yaml k.fits h.fits i.fits": r"k has the largest margin",
     "plot sigma k.fits h.fits i.fits -o s.png": r"k survives 0.47 frames more delay",
     "plot step k.fits h.fits": r"settling time, to 5 %",
-    "limits lbt.yaml k.fits": r"least worst residual is \S+ mas rms",
+    "limits lbt.yaml k.fits": r"worst residual below \S+ mas rms",
     "robustness lbt.yaml k.fits h.fits": r"h keeps the highest Strehl ratio at worst over",
     "tradeoff lbt.yaml --points 2": r"least norm of any filter lies between 15.6",
     "mirror lbt_slow_mirror.yaml": r"The mirror settles within \S+ ms",

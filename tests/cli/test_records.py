@@ -128,6 +128,8 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night):
     assert data["files"] == [str(out.with_suffix(ending)) for ending in (".fits", ".yaml", ".png")]
     assert lbt.load_config(data["files"][1]).plant.vibrations
     assert out.with_suffix(".png").is_file()
+    out.unlink()  # the model may be another's now
+    assert "tt.yaml would be replaced" in run(capsys, "auto", recorded_night, "-o", out)[2]
 
 
 def test_an_open_loop_series_and_one_axis(tmp_path, capsys):

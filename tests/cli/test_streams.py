@@ -97,6 +97,13 @@ def test_characters_that_an_encoding_lacks_are_escaped(monkeypatch, gains):
     assert all(word in out for word in ("\n  quantity", "\n -----"))
 
 
+def test_a_shell_may_close_the_output(monkeypatch, gains):
+    for name, value in (("stdout", None), ("argv", ["", "show", str(gains["kalman"])])):
+        monkeypatch.setattr(sys, name, value)
+    assert refused(entry_point, SystemExit, None).code == 0
+    sys.stdout.close()  # of nothing
+
+
 @pytest.mark.parametrize("terminal", [False, True])
 @pytest.mark.parametrize("quiet", [False, True])
 def test_only_a_terminal_shows_what_is_done(capsys, monkeypatch, terminal, quiet):

@@ -383,9 +383,11 @@ def test_modal_figure_has_all_modes():
 
 def test_limits_name_designs_and_what_moves(config, lbt_designs):
     designs = {"kalman": lbt_designs["kalman"], "slow": lbt_designs["integrator"]}
+    designs["old"] = designs["kalman"]
     study = limits(designs, config.hardware, config.truth, config.imaging, errors_hz=[-1, 1])
     (axes,) = studies.limits_figure(study).axes
-    assert legend(axes)[:2] == ["Kalman", "slow"]
+    assert legend(axes)[:2] == ["slow", "Kalman, old"]
+    assert axes.get_ylim()[0] < min(study.limit.rms_nm, study.residual_nm.min())
     assert axes.get_xlabel() == "frequency of the true vibration [Hz]"
     assert axes.get_ylabel() == "residual [nm rms]"
     assert len({str(line.get_linestyle()) for line in axes.get_lines()[:2]}) == 2

@@ -88,7 +88,8 @@ def test_answers_in_memory_are_in_the_order_of_their_samples():
         assert list(evaluate(reciprocal, iter(samples), pool)) == [1 / i for i, _ in samples]
         with pytest.raises(ZeroDivisionError):  # an error of a sample is as it is here
             list(evaluate(reciprocal, [(1, 0.0), (0, 0.0)], pool))
-    for error in (BrokenExecutor("it is gone"), None):
+    killed = type("KilledWorker", (Exception,), {})("a task on 4 workers")  # Dask's own
+    for error in (BrokenExecutor("it is gone"), killed, None):
         words = "a worker of the executor died .*Start it again"
         with Breaks(error) as pool, pytest.raises(NumericalError, match=words):
             list(evaluate(reciprocal, samples, pool))

@@ -154,18 +154,26 @@ def limits_figure(study: LimitStudy, *, over_errors: bool = False) -> Figure:
         label = shift if study.frequency_hz is None else "frequency of the true vibration"
         start_hz, x_axis = study.frequency_hz or 0.0, (label, "Hz")
     order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
-    names = [row.design if over_errors else design_label(row.design) for row in study.rows]
+    curves: dict[str, FloatArray | None] = {}  # one for designs that leave the same
+    for row, curve in zip(study.rows, study.residual_nm, strict=True):
+        name, drawn = row.design if over_errors else design_label(row.design), list(curves.items())
+        if row.stable:
+            alike = [n for n, c in drawn if c is not None and np.allclose(c, curve, rtol=1e-6)]
+            curves = {n: c for n, c in drawn if n not in alike}
+            name = ", ".join([*alike, name])
+        curves[name] = curve if row.stable else None
     with drawing([2.5]) as (panel,):
         _, factor = name_axes(panel, x_axis, ("residual", "nm rms"), yscale="log")
-        for name, row, residual_nm in zip(names, study.rows, study.residual_nm, strict=True):
-            shown = factor * residual_nm[order] if row.stable else None
-            draw_design(panel, names, name, places, shown)
+        for name, residual_nm in curves.items():
+            shown = None if residual_nm is None else factor * residual_nm[order]
+            draw_design(panel, [*curves], name, places, shown)
         for label, limit, style in (
             ("limit, frequency known", study.limit, ":"),
             ("limit, frequency anywhere in this range", study.band, "--"),
         ):
             if limit is not None and limit.rms_nm > 0:
                 panel.axhline(factor * limit.rms_nm, label=label, linestyle=style, **GUIDE)
+                panel.set_ylim(bottom=min(panel.get_ylim()[0], 0.9 * factor * limit.rms_nm))
     return panel.figure
 
 
