@@ -24,7 +24,7 @@ LINES = {
     "loop": 3964,
     "methods": 784,
     "models": 3753,
-    "report": 3332,
+    "report": 3334,
     "storage": 1125,
     "studies": 3200,
     "errors, validation": 554,
@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 24740,
+    "lines of tests": 24752,
     "lines of benchmarks": 3998,
     "words of docs": 59998,
 }

@@ -195,7 +195,7 @@ _TABLE = """
     --form | plain/estimator | c: as of simulate (default plain)
     --precision | double/single | c: type of all numbers (default double)
     --name | | c: prefix of the C names (default: the output's name without its ending)
-    --order | int | dao: M of the RTC's configuration (default 20)
+    --order | int | dao: M of the RTC's configuration (default 20, or what the design needs)
     --modes | int | c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)
     --other-gain | float | gain of an integrator for each further mode (default: none)
     --steps | int | cacao: frames of history (default: as many as the proof needs)

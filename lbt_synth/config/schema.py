@@ -66,14 +66,17 @@ def by_kind(**keys: tuple[str, ...]) -> Any:
 
 
 def key(text: str, default: Any = ..., **limits: Any) -> Any:
-    """Return a key of a section: what it is, with its unit; its default; limits of its own."""
+    """Return a key of a section: what it is, with its unit; its default; limits.
+
+    A type with limits would hide those of the key.
+    """
     return Field(default, description=text, **limits)
 
 
 class TelescopeSection(Section):
     """The pupil."""
 
-    diameter_m: q.Metres = key("diameter of the pupil [m]", le=1e3)
+    diameter_m: float = key("diameter of the pupil [m]", ge=1e-2, le=1e3)
     obstruction: float = key("central obstruction over the diameter", 0.0, ge=0, le=0.99)
 
 
@@ -91,7 +94,7 @@ class PyramidSection(Section):
 
     wavelength_um: q.Micrometres = key("sensing wavelength [um]")
     modulation_lambda_over_d: q.Gain = key("modulation radius [lambda/D]")
-    subapertures_across: q.Count = key("subapertures over the diameter", le=1000)
+    subapertures_across: int = key("subapertures over the diameter", ge=1, le=1000)
     photons: q.Ratio = key("photons per subaperture and frame")
     read_noise_electrons: q.RatioFromZero = key("read noise per pixel [electrons]")
 
@@ -174,7 +177,7 @@ class LoopSection(Section):
     """Timing, and how many axes there are."""
 
     axes: int | None = key("number of axes (default 2)", None, ge=1, le=2)
-    frame_rate_hz: q.Hertz = key("frame rate [Hz]", ge=0.1)
+    frame_rate_hz: float = key("frame rate [Hz]", ge=0.1, le=1e6)
     delay_frames: float = key("total delay [frames]", 2.0, ge=1, le=LONGEST_DELAY)
 
 
@@ -291,7 +294,7 @@ else:
 class SimulationSection(Section):
     """Time-domain runs."""
 
-    frames: q.Count = key("frames recorded", 8000, ge=2)
+    frames: int = key("frames recorded", 8000, ge=2, le=10**9)
     cases: q.Count = key("independent runs", 4)
     seed: int = key("seed of the random series", 0, ge=0, lt=2**128)
     settle_frames: q.Whole = key("frames before those recorded", 2000)
@@ -320,11 +323,11 @@ class EndToEndSection(Section):
     """The end-to-end simulation; the other sections describe its system."""
 
     pixels: int = key("pixels across the pupil", 60, ge=8, le=10_000)
-    frames: q.Count = key("frames of the exposure", 1600, ge=2)
-    settle_frames: q.Count = key("frames before it", 400, ge=200)
+    frames: int = key("frames of the exposure", 1600, ge=2, le=10**9)
+    settle_frames: int = key("frames before it", 400, ge=200, le=10**9)
     gain: q.RatioFromZero = key("integrator gain of every mode without a filter", 0.5)
     leak: float = key("leak of the integrators", 0.97, ge=0, le=1)
-    leak_from_mode: q.Count = key("first mode with a leak", 50, ge=2)
+    leak_from_mode: int = key("first mode with a leak", 50, ge=2, le=10**9)
     actuators_across: int = key("actuators across the mirror", 31, ge=3, le=1000)
     wind_direction_deg: q.Degrees = key("direction of the wind [deg]; 0 is along tip", 0.0)
     calibration_nm: q.Nanometres = key("amplitude of the calibration [nm]", 20.0)

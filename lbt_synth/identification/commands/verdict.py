@@ -273,11 +273,13 @@ def _doubt_law(law: ControlLaw) -> str:
             f"those of axis {late} follow their measurements {frames} later than those of axis "
             f"{1 - late}; move one of them"
         )
-    largest = np.sum(np.linalg.norm(law.taps, axis=2), axis=1)
-    steady = np.sum(law.taps, axis=1) / largest[:, None]
+    largest = np.sum(np.linalg.norm(law.taps, axis=2), axis=1)[:, None]
+    steady = np.sum(law.taps, axis=1) / largest
     if law.order <= 1 and np.max(abs(steady)) < _LITTLE:
         return "they follow from the changes of the measurements, as if both had been exchanged"
-    if np.all(followed) and np.linalg.cond(steady) > 1 / _LITTLE:
+    # of all lags: those of a long law add up to nearly nothing
+    weights = (law.taps / largest[:, None]).reshape(-1, len(law.taps))
+    if np.all(followed) and np.linalg.cond(weights) > 1 / _LITTLE:
         return "those of both axes follow the same measurements: one axis was recorded twice"
     return ""
 
@@ -436,7 +438,7 @@ def _scale(
     low, high = limits
     seeming = float(np.exp(np.mean(np.log(gain))))
     within = (gain >= low) & (gain <= high)
-    if seeming < low and law is not None and law.is_sure:  # lines hide a gain at which it runs
+    if np.any(gain < low) and law is not None and law.is_sure:  # lines hide a gain at which it runs
         usual = np.geomspace(*PLAUSIBLE_GAINS, 8)
         within |= could_have_run(repair, usual, record, law)
     if high < seeming < _ANOTHER_UNIT * high:  # wide resonances look like that

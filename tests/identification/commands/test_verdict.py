@@ -276,6 +276,21 @@ def test_a_filter_is_known_although_its_measurements_were_rounded() -> None:
         assert verdict.repair.options == options
 
 
+@pytest.mark.parametrize(("telescope", "method"), [("vlt", "kalman"), ("keck", "hinf")])
+def test_the_records_of_long_laws_are_sound(tmp_path, telescope, method) -> None:
+    """Weights add up to nothing with poles near 1; a gain is hidden on one axis alone."""
+    path = tmp_path / "loop.yaml"
+    path.write_text(lbt.config.telescope_template(telescope))
+    config = lbt.load_config(path)
+    law = config.design(method).controller
+    y, u = run_law(law, truth=config.truth, hardware=config.hardware, frames=8000, seed=0)
+    loop = config.hardware
+    known = {"frame_rate_hz": loop.frame_rate_hz, "delay_frames": loop.delay_frames, "unit": "nm"}
+    assert explain_commands(loop_record(y, u, **known)).explanation == AS_GIVEN
+    twice = explain_commands(loop_record(y, u[:, [0, 0]], **known))
+    assert "one axis was recorded twice" in twice.explanation
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_and_repaired(fault) -> None:
     wrong = wrong_record(fault)
