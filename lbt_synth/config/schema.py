@@ -2,48 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import Discriminator, Field, Tag, ValidationError, create_model, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationError, create_model
 
 from lbt_synth.methods import quantities as q
-from lbt_synth.methods.method import Section
+from lbt_synth.methods.method import Section, exactly_one, rule
 from lbt_synth.methods.registry import METHODS
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.vibration import MOST_SECTIONS
 
-Matrix: TypeAlias = list[list[q.Entry]]
+_Row: TypeAlias = Annotated[list[q.Entry], Field(min_length=1)]
+Matrix: TypeAlias = Annotated[list[_Row], Field(min_length=1)]
 _TAGS = (q.ONE, q.EACH)  # in the places of mistakes
 _TWO_DIRECTIONS = "expected at most one of axis, direction_deg"
 _SECTIONS = "how many equal resonances in series it is: a bump of steep flanks has 2 to 4"
-
-
-def _rule(mistake: Callable[[Any], str]) -> Any:
-    """Return a rule of a section, from a function that says what is wrong, or nothing."""
-
-    def check(section: Any) -> Any:
-        if text := mistake(section):
-            raise ValueError(text)
-        return section
-
-    return model_validator(mode="after")(check)
 
 
 def _count_given(section: Any, names: Iterable[str]) -> int:
     return sum(getattr(section, name) is not None for name in names)
 
 
-def exactly_one(*names: str) -> Any:
-    """Return the rule that a section has exactly one of some keys."""
-    text = f"expected exactly one of {', '.join(names)}"
-    return _rule(lambda section: "" if _count_given(section, names) == 1 else text)
-
-
 def goes_with(name: str, other: str) -> Any:
     """Return the rule that a key makes sense beside another one alone."""
     text = f"{other} goes with {name}, and only with it"
-    return _rule(lambda s: text if _count_given(s, [name]) < _count_given(s, [other]) else "")
+    return rule(lambda s: text if _count_given(s, [name]) < _count_given(s, [other]) else "")
 
 
 def by_kind(**keys: tuple[str, ...]) -> Any:
@@ -62,7 +46,7 @@ def by_kind(**keys: tuple[str, ...]) -> Any:
                 return f"{name} is missing, which goes with kind: {section.kind}"
         return ""
 
-    return _rule(mistake)
+    return rule(mistake)
 
 
 def key(text: str, default: Any = ..., **limits: Any) -> Any:
@@ -195,7 +179,7 @@ class _LineSection(Section):
         "accelerometer channels that move with it", None
     )
     _one_size = exactly_one("rms_nm", "rms_mas")
-    _one_direction = _rule(
+    _one_direction = rule(
         lambda line: _TWO_DIRECTIONS * (None not in (line.axis, line.direction_deg))
     )
 

@@ -84,7 +84,7 @@ class LoopHardware(Summarised):
         float,
         ("at_least", 1),
         ("at_most", LONGEST_DELAY),
-        ("hint", "One frame is the exposure itself: no loop is faster."),
+        ("hint", "The exposure itself is one frame, and each frame adds states."),
     ] = 2.0
     sensor_matrix: FloatArray | None = None
     influence_matrix: FloatArray | None = None
