@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3208,
-    "config": 1622,
-    "design": 5985,
-    "files": 1252,
-    "identification": 8875,
-    "interop": 3687,
+    "cli": 3207,
+    "config": 1627,
+    "design": 6001,
+    "files": 1263,
+    "identification": 8896,
+    "interop": 3727,
     "linear": 4756,
-    "loop": 3964,
+    "loop": 3982,
     "methods": 784,
-    "models": 3753,
-    "report": 3334,
-    "storage": 1125,
+    "models": 3761,
+    "report": 3352,
+    "storage": 1134,
     "studies": 3200,
-    "errors, validation": 554,
+    "errors, validation": 555,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
-    "tuned constants": 498,
-    "lines of tests": 24752,
+    "tuned constants": 501,
+    "lines of tests": 24886,
     "lines of benchmarks": 3998,
-    "words of docs": 60008,
+    "words of docs": 60087,
 }
 
 

@@ -39,6 +39,7 @@ from lbt_synth.storage.words import count_text
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
     from lbt_synth.design import Design
     from lbt_synth.identification.auto import RecordedDesign
+    from lbt_synth.identification.prediction.comparison import PredictionRow
 
 
 _STEPS = 3  # that diagnose and auto count
@@ -191,11 +192,10 @@ def _say_held_out(
 
     best, name = made.held_out[made.name], made.name
     report.data |= {"gain_over_what_ran": None, "wavelength_um": imaging.wavelength_um}
-    after = nm_text(best.replayed_nm, ".1f")
-    said = f"The {name} leaves {after} rms on unseen data"
+    said = f"The {name} leaves {_rms_text(best, ' rms')} on unseen data"
     if record.commands is not None:
         ran = made.held_out[RAN]
-        said += f", where what ran left {nm_text(ran.replayed_nm, '.1f')}"
+        said += f", where what ran left {_rms_text(ran)}"
         if ran.strehl >= 0 and best.strehl >= 0:
             said += f"; {imaging.label} (tip and tilt) {ran.strehl:.3f} -> {best.strehl:.3f}"
         report.data["gain_over_what_ran"] = {
@@ -213,6 +213,13 @@ def _say_held_out(
             "leaves something out."
         )
     report.notes += [marked_note(note) for note in made.notes]
+
+
+def _rms_text(row: PredictionRow, unit: str = "") -> str:
+    """Return the residual of a row on the data, or its bound where the noise hides it."""
+    if row.replayed is not None and row.replayed.hidden:
+        return row.replayed.text
+    return nm_text(row.replayed_nm, ".1f") + unit
 
 
 def run_diagnose(arguments: Namespace) -> Report:

@@ -234,7 +234,8 @@ def design_from_record(
 
 def _say_price(price: str, now: PredictionRow | None, before: PredictionRow | None) -> str:
     """Say what a design that assumes more noise leaves on unseen data, and without that."""
-    leaves = [nm_text(np.nan if row is None else row.replayed_nm) for row in (now, before)]
+    unknown = "an unknown residual"
+    leaves = [row.replayed.text if row and row.replayed else unknown for row in (now, before)]
     return f"{price}. It leaves {leaves[0]} on unseen data, and without that {leaves[1]}"
 
 
@@ -330,20 +331,25 @@ def quick_methods() -> list[str]:
 def choose_method(residuals: Mapping[str, ResidualEstimate]) -> tuple[str, str]:
     """Choose the default method, unless another one leaves clearly less on every third of a test.
 
-    The residuals are by the titles of methods; return one of these, and why it is chosen.
+    The residuals are by the titles of methods; return one of these, and why it is chosen. One that
+    the noise hides counts as its bound.
     """
-    ordered = sorted(residuals, key=lambda title: residuals[title].total_nm2)
+    ordered = sorted(residuals, key=lambda title: residuals[title].safe_nm2)
     usual = method_named(default_method()).title
     usual = usual if usual in residuals else ordered[0]
     for title in ordered:
         thirds = zip(residuals[usual].parts(3), residuals[title].parts(3), strict=True)
-        if all(third.is_clearly_above(rival) for third, rival in thirds):
+        if residuals[title].safe_nm2 < residuals[usual].total_nm2 and all(
+            third.is_clearly_above(rival) for third, rival in thirds
+        ):
             difference, error = residuals[usual].above(residuals[title])
             return title, (
                 f"the {title} is chosen: on each third of the test it leaves less than the "
                 f"{usual}, in all by {nm_text(difference, error_nm=error, unit='nm^2')}"
             )
-    return usual, f"the {usual} stays: no method leaves clearly less on each third of the test"
+    note = f"the {usual} stays: no method leaves clearly less on each third of the test"
+    is_hidden = any(residual.hidden for residual in residuals.values())
+    return usual, note + ", as far as the noise shows" * is_hidden
 
 
 def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:

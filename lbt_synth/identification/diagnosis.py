@@ -431,7 +431,7 @@ def _compare(
     )
     plant = half.plant()
     designs[INTEGRATOR] = integrator(plant.hardware, truth=plant)  # the comparison has it
-    residuals = {row.name: row.replayed.total_nm2 for row in table.entries if row.replayed}
+    residuals = {row.name: row.replayed.safe_nm2 for row in table.entries if row.replayed}
     best = min(designs, key=lambda name: residuals[name])
     costs = disturbance_costs(half, running, designs[best].controller)
     return replace(diagnosis, comparison=table, best=best, best_design=designs[best], costs=costs)

@@ -144,6 +144,15 @@ def test_an_open_loop_series_and_one_axis(tmp_path, capsys):
     assert not (tmp_path / "t.png").exists()
 
 
+def test_a_residual_that_the_noise_hides_has_a_bound(tmp_path, capsys):
+    np.save(tmp_path / "noise.npy", 300 * np.random.default_rng(1).standard_normal(5000))
+    words = ("--columns", "open_loop=0", "--no-figure", "-o", tmp_path / "t.fits", *FACTS)
+    data = run_json(capsys, "auto", tmp_path / "noise.npy", *words)
+    (row,) = (row for row in data["held_out"] if row["name"] == "Kalman filter")
+    assert row["data_nm"] is row["strehl"] is None
+    assert "leaves at most 76 nm (the noise hides it) on unseen data." in data["verdict"][0]
+
+
 def test_several_nights_make_one_design_and_a_table(tmp_path, capsys) -> None:
     files = []
     for seed, hz in enumerate((29.0, 33.0)):

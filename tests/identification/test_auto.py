@@ -115,6 +115,25 @@ def test_the_default_stays_unless_another_wins_every_part(differences, error, ch
     assert auto.choose_method({OTHER: other})[0] == OTHER
 
 
+def test_a_residual_that_the_noise_hides_wins_by_its_bound_only():
+    """Of 300 and 0 nm^2, the second is chosen as long as it is surely below 300."""
+    levels, less = residuals((300.0, 300.0, 300.0), 4.0), np.full((1, 1), 700.0)
+    for error_nm2, chosen in ((100.0, OTHER), (200.0, USUAL)):
+        usual, other = (
+            replace(
+                level,
+                noise_nm2=less,
+                covariance_nm2=level.covariance_nm2 - less,
+                error_nm4=np.full((1, 1), error_nm2**2),
+            )
+            for level in levels
+        )
+        assert other.hidden
+        title, note = auto.choose_method({USUAL: usual, OTHER: other})
+        assert title == chosen
+        assert ("as far as the noise shows" in note) == (chosen == USUAL)
+
+
 def test_all_quick_methods_are_in_the_table_of_unseen_data(monkeypatch):
     made = lbt.design_from_record(night_record(), sensor_gain=GAIN, most_lines=1)
     names = [row.name for row in made.held_out.entries]

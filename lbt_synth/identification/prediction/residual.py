@@ -95,6 +95,16 @@ class ResidualEstimate:
         upper = max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)
         return float("nan") if self.refuted else float(np.sqrt(upper))
 
+    @property
+    def hidden(self) -> bool:
+        """Whether the noise hides it: the variance is not above its standard error."""
+        return self.total_nm2 <= self.total_error_nm2
+
+    @property
+    def safe_nm2(self) -> float:
+        """Variance by which designs are chosen: its bound where the noise hides it [nm^2]."""
+        return self.total_nm2 + 2 * self.total_error_nm2 * self.hidden
+
     def above(self, other: ResidualEstimate) -> tuple[float, float]:
         """Return how far the variance is above another residual's, and the standard error [nm^2].
 
@@ -144,9 +154,10 @@ class ResidualEstimate:
     def strehl(self, imaging: Imaging) -> float:
         """Long-exposure Strehl ratio of a Gaussian residual of this covariance, in [0, 1].
 
-        A variance below zero counts as zero; where the noise is refuted, the ratio is nan.
+        It is nan where the noise hides the residual, or is refuted; a variance of one axis below
+        zero counts as zero.
         """
-        if self.refuted:
+        if self.refuted or self.hidden:
             return float("nan")
         values, vectors = np.linalg.eigh(self.covariance_nm2)
         covariance = vectors * np.maximum(values, 0.0) @ vectors.T
@@ -157,8 +168,8 @@ class ResidualEstimate:
         """The residual in words, with its error, or with its bound where the noise hides it."""
         if self.refuted:
             return "an unknown residual (the model has more noise than the data)"
-        if self.total_nm2 <= self.total_error_nm2:
-            return f"at most {nm_text(self.upper_nm, '.2g')} (the noise hides it)"
+        if self.hidden:
+            return f"at most {nm_text(self.upper_nm)} (the noise hides it)"
         return nm_text(self.rms_nm, error_nm=self.rms_error_nm)
 
 

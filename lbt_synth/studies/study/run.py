@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -31,9 +31,7 @@ from lbt_synth.storage.atomic_files import (
     refuse_replacing,
     write_atomically,
 )
-from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import cell_text
-from lbt_synth.storage.tables import Table, csv_bytes
+from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.grid import Failure, Result, Sweep, ensemble_columns, loop_columns, refuse
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
@@ -343,19 +341,6 @@ class Replay:
     fresh: dict[str, float]
     failures: tuple[Failure, ...]  # what failed now, the configuration among it
     files: tuple[Path, ...]  # that were written: the configuration, and the designs for this sample
-
-    def table(self, row: int, names: Sequence[str]) -> Table:
-        """List results as they are stored and now, those in nm in the unit that is shown."""
-        unit, factor = shown_unit("nm")
-        rows = []
-        for name in names:
-            shown, scale = name, 1.0
-            if name.endswith("_nm"):
-                shown, scale = f"{name.removesuffix('nm')}{unit}", factor
-            values = (scale * results.get(name, np.nan) for results in (self.stored, self.fresh))
-            rows.append((shown, *map(cell_text, values)))
-        headings = ("result", "stored", "now")
-        return Table(caption=f"Results of row {row}", headings=headings, rows=tuple(rows))
 
 
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:

@@ -107,10 +107,11 @@ def test_a_residual_far_below_zero_refutes_the_noise():
     assert (right.refuted, wrong.refuted) == (False, True)
     assert np.isfinite(right.upper_nm)
     assert shown.text == f"{shown.rms_nm:.3g} +- {shown.rms_error_nm:.2g} nm"
-    assert right.text == f"at most {right.upper_nm:.2g} nm (the noise hides it)"
+    assert right.text == f"at most {right.upper_nm:.3g} nm (the noise hides it)"
     assert "more noise than the data" in wrong.text
-    assert 0 < right.strehl(CAMERA) <= 1
-    assert np.isnan(wrong.strehl(CAMERA))
+    assert 0 < shown.strehl(CAMERA) <= 1
+    assert np.isnan([one.strehl(CAMERA) for one in (right, wrong)]).all()
+    assert (shown.safe_nm2, right.safe_nm2) == (shown.total_nm2, pytest.approx(right.upper_nm**2))
     below = -wrong.total_nm2 / wrong.total_error_nm2
     assert below == pytest.approx(44 * np.sqrt(3600 / 2) / 100, rel=0.1)
     assert np.isnan([wrong.upper_nm, wrong.rms_nm, wrong.rms_error_nm]).all()
