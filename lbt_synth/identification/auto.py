@@ -205,6 +205,8 @@ def design_from_record(
         if row := table.row(title):
             entries = (*held_out.entries, replace(row, name=f"{title}, axes mixed"))
             held_out = replace(held_out, entries=entries)
+            mixes = row.replayed.text if row.replayed else "an unknown residual"
+            notes.append(f"with axes that mix, the {title} leaves {mixes} on unseen data")
     step(1)
     model, request = identify(record, start=mixed, **options), design_request(method, {})
     model = model.separated() if separate_axes else model
