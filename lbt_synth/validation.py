@@ -32,7 +32,7 @@ Positive: TypeAlias = Annotated[float, ("above", 0)]
 NotNegative: TypeAlias = Annotated[float, ("at_least", 0)]
 Obstruction: TypeAlias = Annotated[float, ("at_least", 0), ("below", 1)]
 Count: TypeAlias = Annotated[int, ("at_least", 1)]
-_PARTS = "plant", "hardware", "truth", "design", "controller", "model"  # of larger objects
+_PARTS = "plant", "hardware", "truth", "design", "controller", "model", "imaging"  # of objects
 _RELATIONS = {
     "above": operator.gt,
     "at_least": operator.ge,
@@ -70,7 +70,8 @@ def float_array(value: Any, name: str) -> FloatArray:
     if raw.dtype.kind == "c":
         raise ProblemError(f"{name} must be real; got complex numbers.")
     if raw.dtype.kind not in "fiub":
-        raise ProblemError(f"{name} must be an array of numbers; got {type(value).__name__}.")
+        kind = f" of dtype {raw.dtype}" if raw.ndim else ""
+        raise ProblemError(f"{name} must be an array of numbers; got {type(value).__name__}{kind}.")
     return np.asarray(raw, dtype=np.float64)
 
 

@@ -10,6 +10,7 @@ import tomllib
 from types import SimpleNamespace
 
 import pytest
+from console_blocks import corrected, distance, shape
 from ruamel.yaml import YAML
 from support.plants import ROOT
 
@@ -121,3 +122,14 @@ def test_names_that_a_script_uses_are_there(script):
             thing = lbt
             while path and inspect.ismodule(thing):
                 thing = getattr(thing, path.pop(0))
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize("name", ["tutorial", "diagnose"])
+def test_commands_print_what_the_page_shows(name, tmp_path):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    (tmp_path / "out").mkdir()
+    page = ROOT / "docs" / f"{name}.md"
+    shown, today = page.read_text().splitlines(), corrected(page, tmp_path)
+    assert [*map(shape, today)] == [*map(shape, shown)]
+    assert max(map(distance, today, shown)) < 0.01

@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3208,
-    "config": 1622,
-    "design": 5985,
-    "files": 1252,
-    "identification": 8875,
-    "interop": 3687,
-    "linear": 4756,
-    "loop": 3964,
-    "methods": 784,
-    "models": 3753,
-    "report": 3332,
-    "storage": 1125,
+    "cli": 3217,
+    "config": 1629,
+    "design": 6028,
+    "files": 1263,
+    "identification": 8956,
+    "interop": 3732,
+    "linear": 4766,
+    "loop": 3982,
+    "methods": 803,
+    "models": 3771,
+    "report": 3351,
+    "storage": 1134,
     "studies": 3200,
-    "errors, validation": 554,
+    "errors, validation": 555,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
-    "tuned constants": 498,
-    "lines of tests": 24740,
+    "tuned constants": 502,
+    "lines of tests": 25007,
     "lines of benchmarks": 3998,
-    "words of docs": 60007,
+    "words of docs": 60055,
 }
 
 

@@ -26,6 +26,7 @@ def test_refusals():
         (partial(matrix, np.ones((1, 4)), "C", cols=COLUMNS), DimensionError, SIZES),
         *((partial(matrix, bad, "M"), ProblemError, "M must") for bad in ("text", None, [[1j]])),
         *((partial(matrix, bad, "M"), DimensionError, "M must") for bad in MISSHAPEN),
+        (partial(matrix, np.array([[{}]]), "M"), ProblemError, "got ndarray of dtype object"),
         (partial(semidefinite, SKEW, "Q"), DefinitenessError, "symmetric; got an asy"),
         (partial(semidefinite, [[1, 2], [2, 1]], "Q"), DefinitenessError, "semidefinite; got a le"),
         (lambda: definite([[1.0, 1.0], [1.0, 1.0]], "R"), DefinitenessError, "R must be positive"),

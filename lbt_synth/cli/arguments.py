@@ -30,7 +30,7 @@ _SHARED = """
   gain | gain | | gain file (.fits or .npz)
   gains | gains | nargs:* meta:gain | gain files (.fits or .npz)
   gains+ | gains | nargs:+ meta:gain | gain files (.fits or .npz)
-  unit | --unit | @units | of wavefronts (default: the configuration's, else nm; JSON has nm)
+  unit | --unit | @units | of wavefronts (default: the file's, else nm; JSON has nm)
   outputs | -o --output | repeat | table (.csv) or figure (.png, .pdf, .svg); repeatable
   pdf | --pdf | meta:FILE | write the same as a PDF, too (.pdf)
   jobs | --jobs | int =1 | processes
@@ -42,8 +42,8 @@ _SHARED = """
         to be those that the mirror followed; what lbt-synth telemetry -o writes says all of it
     --frame-rate-hz | float | frame rate [Hz]
     --delay-frames | float | total delay [frames]
-    --unit | | of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too
-    --show-unit | @units | what results are shown in (JSON and CSV stay in nm)
+    --unit | | of the measurements: nm, um, m, mas, arcsec, urad, rad
+    --show-unit | @units | of what is shown (default: the record's; JSON and CSV stay in nm)
     --command-unit | | of the commands (default: --unit)
     --diameter-m | float | telescope diameter [m], for angles
     --obstruction | float | as a fraction of the diameter
@@ -183,6 +183,7 @@ _TABLE = """
     known judged accelerometers
     >
     --method | @record_methods | default: kalman, unless another quick one leaves less
+    --separate-axes | switch | no axis reads the other, for one filter per mode (dao)
     -o --output | required | gain file (.fits or .npz); the configuration of one record goes beside
         it (.yaml)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
@@ -195,7 +196,7 @@ _TABLE = """
     --form | plain/estimator | c: as of simulate (default plain)
     --precision | double/single | c: type of all numbers (default double)
     --name | | c: prefix of the C names (default: the output's name without its ending)
-    --order | int | dao: M of the RTC's configuration (default 20)
+    --order | int | dao: M of the RTC's configuration (default 20, or what the design needs)
     --modes | int | c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)
     --other-gain | float | gain of an integrator for each further mode (default: none)
     --steps | int | cacao: frames of history (default: as many as the proof needs)

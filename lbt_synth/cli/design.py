@@ -14,6 +14,7 @@ from lbt_synth.cli.loop_inputs import (
     add_certificate,
     add_truth,
     choose_design_unit,
+    keep_unit,
     load_shown,
     say_accelerometers,
 )
@@ -40,7 +41,7 @@ def run_design(arguments: Namespace) -> Report:
     require_writable(require_gain_name(arguments.output), inputs=input_files(arguments))
     config = load_shown(arguments)
     design = config.design(request)
-    path = save_gain(arguments.output, design)
+    path = save_gain(arguments.output, keep_unit(design, config.imaging.diameter_m))
     report = Report()
     add_truth(report, design, config, without=() if options else (request.method.name,))
     describe_design(report, design)
@@ -153,7 +154,7 @@ def run_show(arguments: Namespace) -> Report:
     report.notes += [
         f"proved: the certificate, computed again from this file of digest {digest}.",
         "not proved, the file's word: the solver's route and status, what a record shows, "
-        "assumptions, and the configuration.",
+        "assumptions, the configuration, and the telescope's diameter.",
     ]
     if not design.other_sensors:
         from lbt_synth.interop.c.export import frame_cost  # which a design does not need

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
+from lbt_synth.storage.display_unit import LENGTHS, nm_text, show_in, shown_unit
 from lbt_synth.storage.rows import Column, fact
 from lbt_synth.studies.limits import compare_in_truth, say_residual
 
@@ -34,31 +35,31 @@ _NAME, _BASELINE = "this design", "integrator"
 def choose_unit(
     arguments: Namespace,
     diameter_m: float | None = None,
-    configured: str | None = None,
+    usual: str | None = None,
     *,
     all_modes: bool = False,
 ) -> None:
-    """Show wavefronts in the unit that is asked for, else in that of the configuration, else in nm.
+    """Show wavefronts in the unit of the option, else in the usual one, else in nm.
 
-    An angle needs the telescope's diameter, and is none of modes beside tip and tilt.
+    That is the unit of the configuration, or of a record or gain file where there is none. An angle
+    needs the telescope's diameter, and is none of modes beside tip and tilt.
     """
-    asked = getattr(arguments, "show_unit", None) or arguments.unit
-    asked = asked if asked in UNITS else None  # a record may be in others
+    asked = arguments.show_unit if hasattr(arguments, "show_unit") else arguments.unit
     if asked not in (None, *LENGTHS) and all_modes:
         raise ProblemError(
             f"--unit {asked} is an angle of tip and tilt, and this command shows other modes, "
             f"too. Try {' or '.join(LENGTHS)}."
         )
-    usual = "nm" if all_modes and configured not in LENGTHS else configured
+    usual = "nm" if all_modes and usual not in LENGTHS else usual
     name = asked or usual or "nm"
     if name in LENGTHS:
         show_in(name, LENGTHS[name])
         return
     if diameter_m is None:
+        place = "telescope.diameter_m in the configuration (of a gain file: and design again)"
         raise ProblemError(
             f"a wavefront is shown in {name} by the telescope's diameter, which is not known here. "
-            "Give telescope.diameter_m in the configuration, --diameter-m with a record, or take "
-            "nm."
+            f"Give {'--diameter-m' if hasattr(arguments, 'diameter_m') else place}, or take nm."
         )
     mas = nm_per_mas(diameter_m)
     show_in(name, mas if name == "mas" else mas * _MAS_PER_URAD)
@@ -74,12 +75,20 @@ def load_shown(
 
 
 def choose_design_unit(arguments: Namespace, designs: Mapping[str, Design]) -> None:
-    """Show wavefronts in the unit that the configurations in gain files agree on."""
-    texts = {design.configuration: path for path, design in designs.items()}
-    configs = [config_from_text(text, Path(path)) for text, path in texts.items() if text]
-    telescopes = {(config.imaging.diameter_m, config.settings.units) for config in configs}
-    alone = telescopes.pop() if len(telescopes) == 1 else (None, None)
-    choose_unit(arguments, *alone)
+    """Show wavefronts in the unit that gain files, or the configurations in them, agree on."""
+    telescopes = set[tuple[float | None, str | None]]()
+    for path, design in designs.items():
+        if design.shown_unit is not None:
+            telescopes.add((design.diameter_m, design.shown_unit))
+        elif design.configuration:
+            config = config_from_text(design.configuration, Path(path))
+            telescopes.add((config.imaging.diameter_m, config.settings.units))
+    choose_unit(arguments, *(telescopes.pop() if len(telescopes) == 1 else ()))
+
+
+def keep_unit(design: Design, diameter_m: float | None) -> Design:
+    """Return a design that its gain file shows as this command does."""
+    return replace(design, diameter_m=diameter_m, shown_unit=shown_unit("nm")[0])
 
 
 def load_design(path: str, config: Config | None = None) -> Design:

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.cli.arguments import given_options, input_files
-from lbt_synth.cli.loop_inputs import choose_unit, load_designs, load_shown
+from lbt_synth.cli.loop_inputs import choose_unit, keep_unit, load_designs, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, track_progress
 from lbt_synth.cli.study import run_in_parts
+from lbt_synth.cli.telemetry import write_telemetry
 from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
-from lbt_synth.files import Telemetry, load_gain, save_gain, save_telemetry
+from lbt_synth.files import Telemetry, load_gain, save_gain
 from lbt_synth.interop.specula import simulation
 from lbt_synth.interop.specula.optics import Calibration, EndToEndSetup, calibrate, specula_version
 from lbt_synth.interop.specula.simulation import EndToEndRun, mix_controller, unread_sensors
@@ -98,9 +99,10 @@ def _draw_paper(
         "robustness": figures.robustness_figure(rows, points),
         "sigma": loop_figure(labelled, "sigma", unit_weights=True),
     }
+    kept = [keep_unit(design, published.DIAMETER_M) for design in filters]
     return [
         *(save_figure(drawn[n], folder / f"{n}{end}") for n in drawn for end in (".png", ".pdf")),
-        *(save_gain(folder / f"paper_{design.method}.fits", design) for design in filters),
+        *(save_gain(folder / f"paper_{design.method}.fits", design) for design in kept),
     ]
 
 
@@ -149,10 +151,8 @@ def run_end_to_end(arguments: Namespace) -> Report:
             "note: the pyramid is the only wavefront sensor of the simulation: the fall-back "
             f"filter of the gain file runs, without {listing_text(unread)}."
         )
-    report.note_written(
-        save_figure(figures.end_to_end_figure(loop_run), figure_file),
-        save_telemetry(telemetry_file, _telemetry(loop_run, design, gain)),
-    )
+    report.note_written(save_figure(figures.end_to_end_figure(loop_run), figure_file))
+    write_telemetry(report, str(telemetry_file), _telemetry(loop_run, design, gain))
     return report
 
 
@@ -172,7 +172,7 @@ def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, 
         other_modes_strehl=fact(numbers["other_modes_strehl"], "  without tip and tilt", **PERCENT),
         tip_rms_nm=fact(numbers["tip_rms_nm"], "tip", **rms),
         tilt_rms_nm=fact(numbers["tilt_rms_nm"], "tilt", **rms),
-        other_modes_rms_nm=fact(numbers["other_modes_rms_nm"], "all other modes", **rms),
+        other_modes_rms_nm=fact(numbers["other_modes_rms_nm"], "other modes", **rms, fixed=True),
         tip_tilt_gain=fact(ratio, "optical gain of tip and tilt", format=".3f"),
         tip_tilt_gain_error=fact(error, "  standard error", format=".3f"),
         tip_tilt_noise_nm=fact(
@@ -189,15 +189,15 @@ def _require_seen(loop_run: EndToEndRun) -> None:
         pixels = loop_run.setup.pixels
         raise UnstableLoopError(
             "the pyramid must see tip and tilt; got an optical gain of "
-            f"{loop_run.tip_tilt_gain:.2g} at residuals of {tip:.3g} and {tilt:.3g} nm rms: the "
-            f"loop ran away. Try more than {pixels} pixels (--pixels), brighter light, or lower "
-            "gains."
+            f"{loop_run.tip_tilt_gain:.2g} at residuals of {nm_text(tip)} and {nm_text(tilt)} rms: "
+            f"the loop ran away. Try more than {pixels} pixels (--pixels), brighter light, or "
+            "lower gains."
         )
 
 
 def _load_setup(arguments: Namespace) -> EndToEndSetup:
     """Load the end-to-end setup of a configuration, with the changes of the command line."""
-    setup = load_shown(arguments, all_modes=True).end_to_end
+    setup = load_shown(arguments).end_to_end
     return replace(setup, **given_options(arguments, *_SETTINGS))
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from lbt_synth import identification, studies
 from lbt_synth.cli.arguments import input_files, refuse_options
-from lbt_synth.cli.loop_inputs import add_certificate, choose_unit, load_designs, say_accelerometers
+from lbt_synth.cli.loop_inputs import add_certificate, keep_unit, load_designs, say_accelerometers
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, printable
 from lbt_synth.cli.telemetry import load_series, record_imaging, record_telescope, require_series
@@ -32,7 +32,7 @@ from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
-from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.words import count_text
 
@@ -53,7 +53,6 @@ def run_identify(arguments: Namespace) -> Report:
     if isinstance(record, LoopRecord):
         record = record.bridged()
         require_length(record)
-    choose_unit(arguments, record.diameter_m)
     readings = read_accelerations(arguments, record)
     options = identification_options(arguments, record)
     doubts = judge_record(arguments, record)
@@ -100,7 +99,6 @@ def run_auto(arguments: Namespace) -> Report:
         return _run_nights(arguments, gain)
     places = find_places(arguments, gain=gain)
     record = require_series(load_series(arguments), _TESTED).bridged()
-    choose_unit(arguments, record.diameter_m)
     channels, values, notes = read_accelerations(arguments, record) or (None, None, ())
     imaging = record_imaging(arguments, record)
     with count_progress(total=_STEPS, what="identifying and designing") as count:
@@ -110,6 +108,7 @@ def run_auto(arguments: Namespace) -> Report:
             imaging=imaging,
             accept_record=arguments.accept_record,
             command_scale_known=_knows_scale(record),
+            separate_axes=arguments.separate_axes,
             accelerations=values,
             channels=channels,
             progress=count,
@@ -162,10 +161,10 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
             progress=count,
             accept_record=arguments.accept_record,
             command_scale_known=all(map(_knows_scale, nights.values())),
+            separate_axes=arguments.separate_axes,
             lowest_line_hz=arguments.lowest_line_hz,
             most_lines=arguments.most_lines,
         )
-    choose_unit(arguments, nights[names[0]].diameter_m)
     design = _with_repairs(made.design, *nights.values())
     report = Report(
         data={"sources": arguments.files, "written": made.name, "method": design.method},
@@ -183,7 +182,7 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
     ]
     report.add_rows("nights", "Residual by the model of each night", rows)
     add_certificate(report, design)
-    report.note_written(save_gain(gain, design))
+    report.note_written(save_gain(gain, keep_unit(design, nights[names[-1]].diameter_m)))
     return report
 
 
@@ -240,7 +239,6 @@ def run_diagnose(arguments: Namespace) -> Report:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
     designs = {} if arguments.gain is None else load_designs([arguments.gain])
     both = require_series(load_series(arguments), _EXAMINES)
-    choose_unit(arguments, both.diameter_m)
     live = live_axes(both)
     some = len(live) not in (0, both.axes)
     record = require_series(load_series(arguments, live), _EXAMINES) if some else both
@@ -373,10 +371,12 @@ def write_files(
         **record_telescope(arguments, record),
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
         accelerometers=accelerometers,
+        units=shown_unit("nm")[0],
     )
     text = config_text(settings, comments).encode()
     for design in (designs or {}).values():
-        report.note_written(save_gain(places["gain"], design))
+        kept = keep_unit(design, record.diameter_m)
+        report.note_written(save_gain(places["gain"], kept))
     report.note_written(write_atomically(places["model"], text))
     report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
     if "figure" in places:

@@ -16,7 +16,7 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, print_error
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
-from lbt_synth.report.pages import study_verdict
+from lbt_synth.report.pages import replay_table, study_verdict
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.executors import choose_engine
 from lbt_synth.storage.words import duration_text
@@ -107,8 +107,7 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             *(f"warning: failed: {name}: {error}" for _, name, error in replay.failures),
         ],
     )
-    results = [(name, stored.get(name), fresh.get(name)) for name in loaded.result_columns]
-    report.add_table(f"Results of row {row}", ("result", "stored", "now"), results)
+    report.tables.append(replay_table(replay, row, loaded.result_columns))
     report.note_written(*replay.files)
     return report
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.cli.arguments import given_options, input_files, refuse_options
-from lbt_synth.cli.loop_inputs import choose_unit, load_designs
+from lbt_synth.cli.loop_inputs import load_designs
 from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.cli.telemetry import load_series, record_imaging, require_series
 from lbt_synth.errors import GainFileError
@@ -75,7 +75,6 @@ def run_rehearse(arguments: Namespace) -> Report:
     target, (design,) = arguments.target, load_designs([arguments.gain]).values()
     record = require_series(load_series(arguments), "a rehearsal runs on").bridged()
     require_length(record, frames=_FEWEST, seconds=0)
-    choose_unit(arguments, record.diameter_m)
     imaging = record_imaging(arguments, record)
     rehearsal, rows, hardware = rehearse_record(
         design, record, target, imaging, stroke=arguments.stroke

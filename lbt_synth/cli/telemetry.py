@@ -46,7 +46,7 @@ def require_series(record: LoopRecord | SpectrumRecord, what: str) -> LoopRecord
 def load_series(
     arguments: Namespace, axes: Sequence[int] | None = None
 ) -> LoopRecord | SpectrumRecord:
-    """Load the record of the command line, or some of its axes, whatever its length."""
+    """Load the record of the command line, or some of its axes, and show wavefronts in its unit."""
     facts = {name: getattr(arguments, name) for name in _FACTS}
     if axes is not None:
         chosen = facts["axes"]
@@ -57,6 +57,7 @@ def load_series(
         loop=arguments.loop,
         **facts,
     )
+    choose_unit(arguments, record.diameter_m, record.shown_unit)
     repair = CommandRepair(
         increments=arguments.command_increments,
         shift_frames=arguments.command_shift_frames,
@@ -131,7 +132,7 @@ def run_telemetry(arguments: Namespace) -> Report:
         record = require_series(load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
         notes = [f"note: {note}" for note in (record.summary(), *record.notes)]
-    choose_unit(arguments, telemetry.diameter_m)
+    choose_unit(arguments, telemetry.diameter_m, telemetry.shown_unit)
     report = _describe_telemetry(telemetry)
     report.data["file"] = arguments.file
     report.notes += notes
@@ -146,7 +147,8 @@ def run_telemetry(arguments: Namespace) -> Report:
 
 
 def write_telemetry(report: Report, output: str, telemetry: Telemetry) -> None:
-    """Write telemetry, and note in the report the file and what its format leaves out."""
+    """Write telemetry with the unit that is shown; note the file and what its format leaves out."""
+    telemetry = replace(telemetry, shown_unit=shown_unit("nm")[0])
     report.note_written(save_telemetry(output, telemetry))
     lost = lost_fields(telemetry) if require_telemetry_name(output) == "aot" else ()
     report.data["lost"] = list(lost)
@@ -184,20 +186,11 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         f"A loop of {count_text(telemetry.modes, 'mode')} at {telemetry.frame_rate_hz:g} Hz, for "
         f"{seconds:.6g} s ({telemetry.frames} frames)."
     )
-    report.add_table(
-        "What the file holds",
-        ("array", "shape", "axes", "unit", "rms"),
-        [
-            (
-                name,
-                " x ".join(map(str, array.shape)),
-                layer.axes,
-                shown_unit(units[name])[0],
-                shown_unit(units[name])[1] * rms[name] if name in rms else None,
-            )
-            for name, array, layer in arrays
-        ],
-    )
+    rows = list[tuple[str | float, ...]]()
+    for name, array, layer in arrays:
+        shape, (unit, factor) = " x ".join(map(str, array.shape)), shown_unit(units[name])
+        rows.append((name, shape, layer.axes, unit, factor * rms.get(name, np.nan)))
+    report.add_table("What the file holds", ("array", "shape", "axes", "unit", "rms"), rows)
     loop = {
         name: fact(getattr(telemetry, name), text, unit=unit)
         for name, (_, unit, text) in FACTS.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
@@ -17,7 +18,7 @@ from lbt_synth.config.schema import (
     TurbulenceSection,
     VibrationSection,
 )
-from lbt_synth.errors import ConfigError, name_key
+from lbt_synth.errors import ConfigError, ProblemError, name_key
 from lbt_synth.models.sensor import illuminated_subapertures
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration, spread_lines
@@ -157,7 +158,8 @@ def _directions(
         angle = np.radians(section.direction_deg)
         return [(float(np.cos(angle)), float(np.sin(angle)))]
     if section.axis is None:
-        raise ConfigError(f"{key}: expected exactly one of axis, direction_deg.", path=key)
+        needed = "expected exactly one of axis, direction_deg; got none"
+        raise ConfigError(f"{key}: {needed}.", path=key)
     return [tuple(direction) for direction in _AXES[section.axis]]
 
 
@@ -223,6 +225,19 @@ def _frequency_errors(
     return tuple(section.frequency_error_hz or 0.0 for section in nearest)
 
 
+@contextmanager
+def _name_matrices() -> Iterator[None]:
+    """Call the matrices of a loop by their keys in the message of a ProblemError."""
+    try:
+        yield
+    except ProblemError as error:
+        message = str(error).replace("influence_matrix", "mirror.influence_matrix")
+        message = message.replace("sensor_matrix", "sensor.matrix")
+        keys = "sensor.matrix", "mirror.influence_matrix"
+        path = min((key for key in keys if key in message), key=message.index, default="")
+        raise ConfigError(message, path=path) from error
+
+
 def build_plant(
     settings: FileSection, atmosphere: models.Atmosphere | None, noise_nm: float | FloatArray
 ) -> models.TipTiltPlant:
@@ -230,18 +245,21 @@ def build_plant(
     lines, gain = model_lines(settings), settings.model.sensor_gain
     if isinstance(gain, list):
         _require_length(gain, count_measurements(settings), "model.sensor_gain", "measurement")
-    plant = models.tip_tilt_plant(
-        frame_rate_hz=settings.loop.frame_rate_hz,
-        delay_frames=settings.loop.delay_frames,
-        turbulence=_build_turbulence(settings, atmosphere, noise_nm),
-        vibrations=[line for *_, spread in lines for line in spread],
-        noise_nm=noise_nm,
-        sensor_matrix=settings.sensor.matrix,
-        influence_matrix=settings.mirror.influence_matrix,
-        sensor_gain=gain,
-        modes=count_axes(settings),
-        mirror=_build_mirror(settings.mirror.local_loop),
-    )
+    turbulence = _build_turbulence(settings, atmosphere, noise_nm)
+    mirror = _build_mirror(settings.mirror.local_loop)
+    with _name_matrices():
+        plant = models.tip_tilt_plant(
+            frame_rate_hz=settings.loop.frame_rate_hz,
+            delay_frames=settings.loop.delay_frames,
+            turbulence=turbulence,
+            vibrations=[line for *_, spread in lines for line in spread],
+            noise_nm=noise_nm,
+            sensor_matrix=settings.sensor.matrix,
+            influence_matrix=settings.mirror.influence_matrix,
+            sensor_gain=gain,
+            modes=count_axes(settings),
+            mirror=mirror,
+        )
     if not settings.sensors:
         return plant
     with name_key("sensors"):

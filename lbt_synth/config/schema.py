@@ -2,48 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import Discriminator, Field, Tag, ValidationError, create_model, model_validator
+from pydantic import Discriminator, Field, Tag, ValidationError, create_model
 
 from lbt_synth.methods import quantities as q
-from lbt_synth.methods.method import Section
+from lbt_synth.methods.method import Section, exactly_one, rule
 from lbt_synth.methods.registry import METHODS
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.vibration import MOST_SECTIONS
 
-Matrix: TypeAlias = list[list[q.Entry]]
+_Row: TypeAlias = Annotated[list[q.Entry], Field(min_length=1)]
+Matrix: TypeAlias = Annotated[list[_Row], Field(min_length=1)]
 _TAGS = (q.ONE, q.EACH)  # in the places of mistakes
 _TWO_DIRECTIONS = "expected at most one of axis, direction_deg"
 _SECTIONS = "how many equal resonances in series it is: a bump of steep flanks has 2 to 4"
-
-
-def _rule(mistake: Callable[[Any], str]) -> Any:
-    """Return a rule of a section, from a function that says what is wrong, or nothing."""
-
-    def check(section: Any) -> Any:
-        if text := mistake(section):
-            raise ValueError(text)
-        return section
-
-    return model_validator(mode="after")(check)
 
 
 def _count_given(section: Any, names: Iterable[str]) -> int:
     return sum(getattr(section, name) is not None for name in names)
 
 
-def exactly_one(*names: str) -> Any:
-    """Return the rule that a section has exactly one of some keys."""
-    text = f"expected exactly one of {', '.join(names)}"
-    return _rule(lambda section: "" if _count_given(section, names) == 1 else text)
-
-
 def goes_with(name: str, other: str) -> Any:
     """Return the rule that a key makes sense beside another one alone."""
     text = f"{other} goes with {name}, and only with it"
-    return _rule(lambda s: text if _count_given(s, [name]) < _count_given(s, [other]) else "")
+    return rule(lambda s: text if _count_given(s, [name]) < _count_given(s, [other]) else "")
 
 
 def by_kind(**keys: tuple[str, ...]) -> Any:
@@ -62,18 +46,21 @@ def by_kind(**keys: tuple[str, ...]) -> Any:
                 return f"{name} is missing, which goes with kind: {section.kind}"
         return ""
 
-    return _rule(mistake)
+    return rule(mistake)
 
 
 def key(text: str, default: Any = ..., **limits: Any) -> Any:
-    """Return a key of a section: what it is, with its unit; its default; limits of its own."""
+    """Return a key of a section: what it is, with its unit; its default; limits.
+
+    A type with limits would hide those of the key.
+    """
     return Field(default, description=text, **limits)
 
 
 class TelescopeSection(Section):
     """The pupil."""
 
-    diameter_m: q.Metres = key("diameter of the pupil [m]", le=1e3)
+    diameter_m: float = key("diameter of the pupil [m]", ge=1e-2, le=1e3)
     obstruction: float = key("central obstruction over the diameter", 0.0, ge=0, le=0.99)
 
 
@@ -91,7 +78,7 @@ class PyramidSection(Section):
 
     wavelength_um: q.Micrometres = key("sensing wavelength [um]")
     modulation_lambda_over_d: q.Gain = key("modulation radius [lambda/D]")
-    subapertures_across: q.Count = key("subapertures over the diameter", le=1000)
+    subapertures_across: int = key("subapertures over the diameter", ge=1, le=1000)
     photons: q.Ratio = key("photons per subaperture and frame")
     read_noise_electrons: q.RatioFromZero = key("read noise per pixel [electrons]")
 
@@ -174,7 +161,7 @@ class LoopSection(Section):
     """Timing, and how many axes there are."""
 
     axes: int | None = key("number of axes (default 2)", None, ge=1, le=2)
-    frame_rate_hz: q.Hertz = key("frame rate [Hz]", ge=0.1)
+    frame_rate_hz: float = key("frame rate [Hz]", ge=0.1, le=1e6)
     delay_frames: float = key("total delay [frames]", 2.0, ge=1, le=LONGEST_DELAY)
 
 
@@ -192,7 +179,7 @@ class _LineSection(Section):
         "accelerometer channels that move with it", None
     )
     _one_size = exactly_one("rms_nm", "rms_mas")
-    _one_direction = _rule(
+    _one_direction = rule(
         lambda line: _TWO_DIRECTIONS * (None not in (line.axis, line.direction_deg))
     )
 
@@ -291,7 +278,7 @@ else:
 class SimulationSection(Section):
     """Time-domain runs."""
 
-    frames: q.Count = key("frames recorded", 8000, ge=2)
+    frames: int = key("frames recorded", 8000, ge=2, le=10**9)
     cases: q.Count = key("independent runs", 4)
     seed: int = key("seed of the random series", 0, ge=0, lt=2**128)
     settle_frames: q.Whole = key("frames before those recorded", 2000)
@@ -320,11 +307,11 @@ class EndToEndSection(Section):
     """The end-to-end simulation; the other sections describe its system."""
 
     pixels: int = key("pixels across the pupil", 60, ge=8, le=10_000)
-    frames: q.Count = key("frames of the exposure", 1600, ge=2)
-    settle_frames: q.Count = key("frames before it", 400, ge=200)
+    frames: int = key("frames of the exposure", 1600, ge=2, le=10**9)
+    settle_frames: int = key("frames before it", 400, ge=200, le=10**9)
     gain: q.RatioFromZero = key("integrator gain of every mode without a filter", 0.5)
     leak: float = key("leak of the integrators", 0.97, ge=0, le=1)
-    leak_from_mode: q.Count = key("first mode with a leak", 50, ge=2)
+    leak_from_mode: int = key("first mode with a leak", 50, ge=2, le=10**9)
     actuators_across: int = key("actuators across the mirror", 31, ge=3, le=1000)
     wind_direction_deg: q.Degrees = key("direction of the wind [deg]; 0 is along tip", 0.0)
     calibration_nm: q.Nanometres = key("amplitude of the calibration [nm]", 20.0)

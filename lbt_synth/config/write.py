@@ -98,6 +98,7 @@ def identified_config(
     other_modes_strehl: float = 1.0,
     title: str = "An identified system.",
     accelerometers: AccelerometerTransfers | None = None,
+    units: str = "nm",
 ) -> tuple[FileSection, dict[str, str]]:
     """Return the configuration of an identified system, and standard errors by paths of keys.
 
@@ -113,6 +114,7 @@ def identified_config(
     content = _known_content(
         len(axes), model.frame_rate_hz, model.delay_frames, diameter_m, obstruction
     )
+    content |= {} if units == "nm" else {"units": units}
     noises = [_raised(axis.noise_nm, "sensor.noise_nm", comments) for axis in axes]
     content["sensor"] = {"noise_nm": noises}
     if model.mirror is not None:

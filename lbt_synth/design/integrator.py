@@ -20,6 +20,7 @@ from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
 from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+from lbt_synth.models.loop_hardware import BLIND
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.validation import (
     ComplexArray,
@@ -113,17 +114,20 @@ class IntegratorLaw:
                 f"got {self.zero_hz:g}."
             )
         c = 0.0 if self.zero_hz is None else float(np.exp(-np.pi * self.zero_hz / nyquist_hz))
-        a, reconstructor = self.leak, np.linalg.pinv(hardware.sensor @ hardware.influence)
+        response = hardware.sensor @ hardware.influence
+        a, reconstructor = self.leak, np.linalg.pinv(response, rcond=BLIND)
         D = 0.0
         if self.integrators == 1:  # c may be above the leak: the zero is then a lead
             A, B, C, D = [[a]], [[1.0]], [[1 - c / a]], c / a
         else:
             A, B, C = [[a, 0.0], [a - c, a]], [[1.0], [1.0]], [[0.0, 1.0]]
-        each = np.eye(len(reconstructor))
+        commands = kept = np.eye(len(reconstructor))
+        if a == 1 and np.linalg.matrix_rank(response, rtol=BLIND) < len(kept):
+            kept = reconstructor @ response  # without a leak, what no measurement sees would stay
         return Controller(
-            A=frozen_copy(np.kron(A, each)),
+            A=frozen_copy(np.kron(A, kept)),
             B=frozen_copy(np.kron(B, gain * reconstructor)),
-            C=frozen_copy(np.kron(C, each)),
+            C=frozen_copy(np.kron(C, commands)),
             D=frozen_copy(D * gain * reconstructor),
             dt_s=hardware.dt_s,
         )
@@ -207,8 +211,9 @@ def integrator(
 ) -> IntegratorDesign:
     """Integrator ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
 
-    R is the pseudoinverse of the sensor matrix times the influence matrix. The gain is given; or
-    leaves the least residual for a truth; or is the largest one that keeps the margins of the law.
+    R is the pseudoinverse of the sensor matrix times the influence matrix; combinations of commands
+    that no measurement sees stay zero. The gain is given; or leaves the least residual for a truth;
+    or is the largest one that keeps the margins of the law.
 
     Parameters
     ----------

@@ -21,6 +21,7 @@ Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
 _PLANT_MODELS = ("turbulence", "vibrations", "motions")
+_SHOWN = ("diameter_m", "shown_unit")  # which a design may lack
 _CHECK = ("name", "value", "limit", "computed_by")
 _PROBLEMS: dict[str, type[EstimationProblem | LoopHardware]] = {
     "problem": EstimationProblem,
@@ -55,6 +56,7 @@ class DesignRecord:
                 text(a, "assumptions") for a in sequence(self.meta["assumptions"], "assumptions")
             ),
             "configuration": text(self.meta["configuration"], "configuration"),
+            **{name: self.meta[name] for name in _SHOWN if name in self.meta},
         }
 
     def hardware(self) -> LoopHardware:
@@ -169,6 +171,7 @@ def record_design(design: Design) -> DesignRecord:
         "units": {"commands": "1", "measurements": "1", "phase": "1"},
         "assumptions": list(design.assumptions),
         "configuration": design.configuration,
+        **{name: value for name in _SHOWN if (value := getattr(design, name)) is not None},
     }
     record = DesignRecord(arrays, meta)
     if design.hardware is not None:

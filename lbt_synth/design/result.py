@@ -22,11 +22,12 @@ from lbt_synth.loop import (
 from lbt_synth.loop.closed_loop import reads_others
 from lbt_synth.loop.least_residual import above_percent, least_residual, limit_or_none
 from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.storage.display_unit import require_unit
 from lbt_synth.storage.rows import Column, Facts, fact_table
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import ComplexArray, FloatArray, set_fields
+from lbt_synth.validation import ComplexArray, FloatArray, number, set_fields
 
 if TYPE_CHECKING:
     from lbt_synth.design.shaping import Specification
@@ -106,6 +107,8 @@ class Design(Summarised, ABC):
         What the design rests on and no certificate shows, such as where a sensor gain is from.
     configuration : str
         The configuration that it was made from, as JSON; empty if there was none.
+    diameter_m, shown_unit : float or None, str or None
+        Telescope diameter [m], and the unit in which people see the wavefront: nm, um, mas or urad.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = ()  # what a design of this kind may claim
@@ -121,10 +124,15 @@ class Design(Summarised, ABC):
     solver: SolverReport
     assumptions: tuple[str, ...] = ()
     configuration: str = ""
+    diameter_m: float | None = None
+    shown_unit: str | None = None
 
     def __post_init__(self) -> None:
         if unknown := self.claims.keys() - {claim.name for claim in self.CLAIMS}:
             raise ProblemError(f"a design of {self.method} does not claim {min(unknown)}.")
+        if self.diameter_m is not None:
+            number(self.diameter_m, "diameter_m", above=0)
+        require_unit(self.shown_unit)
         set_fields(self, claims=dict(self.claims), controller=self.make_controller())
 
     @abstractmethod

@@ -170,8 +170,9 @@ def export(
         Of one target. For ``c``: form ("plain" assumes that commands were applied, "estimator" is
         given those that were, :func:`~lbt_synth.linear.estimator_form`; a design of several sensors
         has that form alone), precision ("double" or "single") and name (the prefix of the C names;
-        by default that of the file). For ``dao``: order (M of the RTC's configuration, 20). For
-        ``cacao``: steps (of the history; by default as many as the proof needs).
+        by default that of the file). For ``dao``: order (M of the RTC's configuration; by default
+        20, or what the design needs). For ``cacao``: steps (of the history; by default as many as
+        the proof needs).
 
     Returns
     -------

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError, ProblemError
 from lbt_synth.linear.state_space import LinearSystem, StateSpace
-from lbt_synth.validation import FloatArray, frozen_copy, matrix, suggest_part
+from lbt_synth.validation import FloatArray, float_array, frozen_copy, matrix, suggest_part
 
 _STABLE = 1 - 1e-9  # largest modulus of a pole
 _ROUNDED = 4 * float(np.finfo(np.float64).eps)  # of the terms of a difference that is zero
@@ -152,7 +152,7 @@ class RunningController:
 
 def _signal(values: ArrayLike, name: str, matrix: FloatArray) -> FloatArray:
     """Return a signal that a matrix takes, (q,) or (q, c)."""
-    signal = np.asarray(values, dtype=np.float64)
+    signal = float_array(values, name)
     if signal.ndim not in (1, 2) or len(signal) != matrix.shape[1]:
         raise DimensionError(
             f"{name} must have shape ({matrix.shape[1]},) to match a matrix {matrix.shape}; got "

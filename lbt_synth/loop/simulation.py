@@ -24,7 +24,15 @@ from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.plant.assembly import sensor_memory
 from lbt_synth.storage.summaries import Summarised
-from lbt_synth.validation import FloatArray, choice, frozen_copy, integer, number, require_instance
+from lbt_synth.validation import (
+    FloatArray,
+    choice,
+    float_array,
+    frozen_copy,
+    integer,
+    number,
+    require_instance,
+)
 
 _SETTLED = 1e-4  # decay of the slowest mode after which a loop has settled
 _MOST_SETTLING = 200_000  # frames
@@ -172,6 +180,7 @@ def simulate(
     >>> bool(abs(run.rms_nm[0] / exact.rms_nm - 1) < 0.05)
     True
     """
+    require_instance(hardware, LoopHardware, "hardware")
     if not isinstance(disturbance, Truth):
         require_instance(disturbance, Disturbance, "disturbance")
     limit = np.inf if stroke is None else number(stroke, "stroke", above=0)
@@ -291,7 +300,7 @@ def run_frames(
         if isinstance(controller, RunningController):
             u = controller.step(y, commands[0])
         else:
-            u = np.asarray(controller.step(y), dtype=np.float64)
+            u = float_array(controller.step(y), "the controller's commands")
         finite = bool(np.isfinite(u).all())
         if u.shape != shape or not finite:
             kind = "" if finite else " with values that are not finite"

@@ -29,6 +29,7 @@ from lbt_synth.validation import (
     Positive,
     check_fields,
     real_array,
+    require_instance,
     semidefinite,
 )
 
@@ -122,11 +123,18 @@ def strehl(
     >>> round(lbt.strehl([[300**2, 0], [0, 300**2]], camera), 3)
     0.379
     """
+    require_instance(imaging, Imaging, "imaging")
     if isinstance(residual, ResidualBudget):
         stable, jitter = np.asarray(residual.stable), residual.gaussian_nm2
         lines = residual.line_amplitudes_nm
     else:
-        jitter = semidefinite(residual, "the covariance", stacked=True)
+        covariance = real_array(residual, "the covariance")
+        if not covariance.ndim:
+            raise DimensionError(
+                "the covariance must be a matrix of one or two axes [nm^2]; got a number. Try "
+                "[[rms_nm**2]], or rms_nm**2 / 2 * np.eye(2) for as much on tip as on tilt."
+            )
+        jitter = semidefinite(covariance, "the covariance", stacked=True)
         stable, lines = np.ones(jitter.shape[:-2], bool), np.asarray(line_amplitudes_nm, complex)
         real_array(np.abs(lines), "line_amplitudes_nm")
         lines = lines if lines.size else np.zeros((*stable.shape, 0, jitter.shape[-1]), complex)
@@ -198,6 +206,7 @@ def series_strehl(
     It is the mean, over the frames, of the image of a star at its mean position. What moves within
     a frame counts by its variance: the star stands a deviation to either side on each axis.
     """
+    require_instance(imaging, Imaging, "imaging")
     series = real_array(residual_nm, "residual_nm")
     if series.ndim != 2 or series.shape[0] == 0:
         raise DimensionError(f"residual_nm must be (frames, axes); got shape {series.shape}.")

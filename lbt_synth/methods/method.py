@@ -41,6 +41,29 @@ class Section(BaseModel):
         return self.model_dump()
 
 
+def rule(mistake: Callable[[Any], str]) -> Any:
+    """Return a rule of a section, from a function that says what is wrong, or nothing."""
+
+    def check(section: Any) -> Any:
+        if text := mistake(section):
+            raise ValueError(text)
+        return section
+
+    return model_validator(mode="after")(check)
+
+
+def exactly_one(*names: str) -> Any:
+    """Return the rule that a section has exactly one of some keys."""
+
+    def mistake(section: Any) -> str:
+        used = [name for name in names if getattr(section, name) is not None]
+        if len(used) == 1:
+            return ""
+        return f"expected exactly one of {', '.join(names)}; got {' and '.join(used) or 'none'}"
+
+    return rule(mistake)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DesignInputs:
     """What a method designs for: a plant, and what a configuration or a record says beside it."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from lbt_synth.errors import ConfigError, ProblemError, name_key
-from lbt_synth.methods.method import DesignInputs, Method, Section
+from lbt_synth.methods.method import DesignInputs, Method, Section, exactly_one
 from lbt_synth.methods.quantities import (
     Gain,
     Hertz,
@@ -46,11 +46,7 @@ class BandSection(Section):
     axis: Axis = Field(default="both", description="tip, tilt or both")
     damping: float | None = Field(default=None, ge=0, lt=1, description="damping ratio")
 
-    @model_validator(mode="after")
-    def _require_one_size(self) -> BandSection:
-        if (self.rms_nm is None) == (self.rms_mas is None):
-            raise ValueError("expected exactly one of rms_nm, rms_mas")
-        return self
+    _one_size = exactly_one("rms_nm", "rms_mas")
 
 
 class BoundSection(Section):

@@ -18,6 +18,7 @@ from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy
 
 LONGEST_DELAY = 20  # of a loop [frames]; each is a state of every matrix
 _MOST_MODES = 10_000
+BLIND = 1e-9  # of the largest response to commands, what counts as none: rounding is smaller
 
 
 @table_row
@@ -83,7 +84,7 @@ class LoopHardware(Summarised):
         float,
         ("at_least", 1),
         ("at_most", LONGEST_DELAY),
-        ("hint", "One frame is the exposure itself: no loop is faster."),
+        ("hint", "The exposure itself is one frame, and each frame adds states."),
     ] = 2.0
     sensor_matrix: FloatArray | None = None
     influence_matrix: FloatArray | None = None
@@ -103,6 +104,13 @@ class LoopHardware(Summarised):
             n = influence.shape[0]
         if n < 1 or (influence is not None and influence.shape[1] < 1):
             raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
+        if sensor is not None and influence is not None:
+            sizes = np.linalg.norm(sensor) * np.linalg.norm(influence)
+            if sizes > 0 and np.linalg.norm(sensor @ influence) <= BLIND * sizes:
+                raise ProblemError(
+                    "the sensor must see something that the mirror moves; got a sensor_matrix "
+                    "times influence_matrix of zeros."
+                )
         matrices = {"sensor_matrix": sensor, "influence_matrix": influence}
         for name, value in matrices.items():
             if value is not None and not np.any(value):

@@ -34,10 +34,12 @@ from lbt_synth.report.page.html import (
     paragraph,
     survival_blocks,
 )
-from lbt_synth.storage.rows import row_table
+from lbt_synth.storage.display_unit import shown_unit
+from lbt_synth.storage.rows import cell_text, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import Failure
+from lbt_synth.studies.study.run import Replay
 from lbt_synth.studies.study.statistics import (
     ControllerStatistics,
     Samples,
@@ -198,6 +200,20 @@ def study_verdict(statistics: StudyStatistics) -> list[str]:
             "variance)."
         )
     return verdict
+
+
+def replay_table(replay: Replay, row: int, names: Sequence[str]) -> Table:
+    """List results of a row as stored and now, those in nm in the unit that is shown."""
+    unit, factor = shown_unit("nm")
+    rows = []
+    for name in names:
+        shown, scale = name, 1.0
+        if name.endswith("_nm"):
+            shown, scale = f"{name.removesuffix('nm')}{unit}", factor
+        values = (scale * results.get(name, np.nan) for results in (replay.stored, replay.fresh))
+        rows.append((shown, *map(cell_text, values)))
+    headings = ("result", "stored", "now")
+    return Table(caption=f"Results of row {row}", headings=headings, rows=tuple(rows))
 
 
 def _samples_blocks(study: Study, values: Mapping[str, FloatArray]) -> list[Block]:

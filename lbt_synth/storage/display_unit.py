@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+from lbt_synth.errors import ProblemError
+
 LENGTHS = {"nm": 1.0, "um": 1000.0}  # of wavefront, in nm
 UNITS = (*LENGTHS, "mas", "urad")
 _NM = re.compile(r"\Anm(?=\Z|[ ²^/])")
@@ -35,6 +37,12 @@ def own_display_unit() -> Iterator[None]:
 def show_in(name: str, nm: float) -> None:
     """Choose the unit of what is printed and drawn from now on, of so many nm of wavefront."""
     _SHOWN.set((name, nm))
+
+
+def require_unit(unit: str | None) -> None:
+    """Refuse the name of a unit in which no wavefront is shown."""
+    if unit not in (None, *UNITS):
+        raise ProblemError(f"shown_unit must be one of {', '.join(UNITS)}; got {unit!r}.")
 
 
 def shown_unit(unit: str) -> tuple[str, float]:

@@ -34,6 +34,7 @@ class Column:
     missing: str = "-"  # the cell of nan or None
     key: str = ""  # the name in CSV and JSON; by default that of the field
     name: str = ""  # of the field
+    fixed: bool = False  # whether it stays in its unit, as nm of modes that are no tilt
 
     @property
     def title(self) -> str:
@@ -43,7 +44,7 @@ class Column:
     @property
     def shown_unit(self) -> str:
         """The unit of the numbers in tables, as it is shown."""
-        return shown_unit(self.unit)[0]
+        return self.unit if self.fixed else shown_unit(self.unit)[0]
 
     @property
     def raw_unit(self) -> str:
@@ -53,7 +54,7 @@ class Column:
     def text(self, row: Any) -> str:
         """Return the cell of a row."""
         value = getattr(row, self.name)
-        factor = shown_unit(self.unit)[1]
+        factor = 1.0 if self.fixed else shown_unit(self.unit)[1]
         if self.scale * factor != 1 and value is not None:
             value = self.scale * factor * value
         return cell_text(value, shown_format(self.format, factor), missing=self.missing)

@@ -253,4 +253,4 @@ def say_residual(name: str, row: Facts, limit: ResidualLimit | None) -> str:
     if limit is None or np.isnan(row.above_limit_percent):
         return f"{said}."
     least = nm_text(limit.rms_nm, ".1f")
-    return f"{said}, {row.above_limit_percent:.0f} % above the {least} of the best linear one."
+    return f"{said}, {row.above_limit_percent:z.0f} % above the {least} of the best linear one."

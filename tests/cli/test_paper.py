@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,6 +97,20 @@ def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys):
     status, text, error = run(capsys, *words)
     assert (status, text, list(out.iterdir())) == (1, "", [])
     assert "the loop ran away. Try more than 60 pixels" in error
+
+
+def test_tip_and_tilt_are_shown_as_angles_and_other_modes_are_not(monkeypatch, tmp_path, capsys):
+    loop_run, out = make_run(replace(load_setup(), modes=3), frames=400), tmp_path / "run"
+    calibration = SimpleNamespace(reconstructor=np.eye(2))
+    monkeypatch.setattr(paper, "specula_version", lambda: "1.1")
+    monkeypatch.setattr(paper, "calibrate", lambda *_, **__: calibration)
+    monkeypatch.setattr(paper.simulation, "run_end_to_end", lambda *_, **__: loop_run)
+    words = ("end-to-end", CONFIG, integrator_file(tmp_path), "-o", out, "--unit", "mas")
+    text = run_done(capsys, *words, "--verbose")
+    tip, tilt = loop_run.rms_nm[:2] / lbt.models.nm_per_mas(8.22)
+    assert f"{tip:.2f} mas rms of tip and {tilt:.2f} mas of tilt left" in " ".join(text.split())
+    assert re.search(rf"other modes +{loop_run.rms_nm[2]:.1f} +nm rms", text)
+    assert lbt.files.load_telemetry(out / "telemetry.fits").shown_unit == "mas"
 
 
 @needs_specula

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -87,6 +88,10 @@ def test_the_command(tmp_path, capsys):
     again = run_json(capsys, *words, "--row", "7")
     assert again["fresh"]["a.strehl"] == pytest.approx(again["stored"]["a.strehl"], rel=1e-6)
     assert (folder / "row_7.yaml").exists()
+    shown = run_done(capsys, *words, "--row", "7", "--unit", "mas", "--verbose")
+    (mas,) = re.findall(r"a.residual_mas +\S+ +(\S+)", shown)
+    nm = lbt.models.nm_per_mas(8.22) * float(mas)
+    assert nm == pytest.approx(again["fresh"]["a.residual_nm"], rel=1e-5)
     rows = [(f"study {path} -o {folder} --row 40", "rows 0 to 39; got row 40")]
     refuse_commands(capsys, rows)
 

@@ -58,9 +58,10 @@ OTHER_KEY = [  # what is said of another key, or of none
     ("model.vibrations[0].rms_nm", 5.0, "model.vibrations[0]", "exactly one of rms_nm"),
     ("model.vibrations[0].direction_deg", 5.0, "model.vibrations[0]", "at most one of axis"),
     ("truth.vibrations[0].damping", 0.1, "truth.vibrations[0]", "damping goes with"),
-    ("sensor.noise_nm", 3.0, "sensor", "exactly one of noise_nm, noise_mas, pyramid"),
-    ("sensor.matrix", [[1, 2], [3]], "", "sensor_matrix must be a rectangular array"),
-    ("mirror.influence_matrix", [[0, 0], [0, 0]], "", "got only zeros"),
+    ("sensor.matrix", [[]], "sensor.matrix[0]", "at least 1 item"),
+    ("sensor.noise_nm", 3.0, "sensor", "got noise_nm and pyramid"),
+    ("sensor.matrix", [[1, 2], [3]], "sensor.matrix", "sensor.matrix must be a rect"),
+    ("mirror.influence_matrix", [[0, 0], [0, 0]], "mirror.influence_matrix", "got only zeros"),
     ("model.turbulence", UNSTABLE, "model.turbulence.coefficients", "must be stationary"),
 ]
 TELESCOPE, AIR = "telescope is missing: .*", "atmosphere is missing: .*"
@@ -78,6 +79,7 @@ SECTIONS = [  # of the smallest configuration
     ({"truth": {"turbulence": "frozen_flow"}}, "atmosphere", f"{AIR}truth.turbulence: frozen_flow"),
     ({"atmosphere": GOOD["atmosphere"]}, "telescope", f"{TELESCOPE}the turbulence"),
     # lists of another length, or of other things
+    ({"sensor": {"noise_nm": None}}, "sensor", "one of noise_nm, noise_mas, pyramid; got none"),
     ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one per measurement \(2\); got 1"),
     ({"sensor": {"noise_nm": [1.0, -1.0]}}, "sensor.noise_nm[1]", "greater than or equal to 0.001"),
     ({"model": {"turbulence": [AR]}}, "model.turbulence", r"one per axis \(2\); got 1"),
@@ -90,7 +92,7 @@ SECTIONS = [  # of the smallest configuration
     ({"sensor": {"matrix": [[1, 0], [0, 1]]}, **ONE}, "sensor.matrix", "1 columns .*; got 2"),
     ({**line_in("model", axis="tilt", rms_nm=30.0), **ONE}, "model.vibrations[0]", LEAVE_OUT),
     ({**line_in("truth", direction_deg=3.0, rms_nm=9.0), **ONE}, "truth.vibrations[0]", LEAVE_OUT),
-    (line_in("model", rms_nm=30.0), "model.vibrations[0]", "exactly one of axis, direction_deg"),
+    (line_in("model", rms_nm=30.0), "model.vibrations[0]", "of axis, direction_deg; got none"),
 ]
 
 

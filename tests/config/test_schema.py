@@ -19,3 +19,4 @@ def test_editors_know_every_key_with_its_unit_and_what_is_required():
         assert section["additionalProperties"] is False
     assert SCHEMA["$schema"].endswith("2020-12/schema")
     assert SCHEMA["$defs"]["LoopSection"]["required"] == ["frame_rate_hz"]
+    assert SCHEMA["$defs"]["TelescopeSection"]["properties"]["diameter_m"]["maximum"] == 1000

@@ -10,7 +10,7 @@ from support.refusals import refused, require_refusals
 from support.shaping import ONE, shaped
 
 import lbt_synth as lbt
-from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError
+from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError, ProblemError
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop.simulation import settling_frames
 from lbt_synth.loop.stable_range import affine_radii, parts_by_gain
@@ -87,6 +87,8 @@ def test_refusals():
         (lambda: estimator_form(outside), NumericalError, "a pole of modulus 2, a zero"),
         (lambda: lbt.Controller(**parts, applied=np.ones((2, 1))), DimensionError, "applied must"),
         (lambda: run.step([1, 2], [0]), DimensionError, "applied must have shape"),
+        (lambda: run.step([1, 2j]), ProblemError, "y must be real; got complex"),
+        (lambda: run.step("a"), ProblemError, "y must be an array of numbers; got str"),
     ]
     require_refusals(rows)
     assert refused(*rows[1]).residual == pytest.approx(2)

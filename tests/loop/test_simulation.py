@@ -63,10 +63,14 @@ def test_refusals(axis_plant, sensors_design, sensors_config):
     line = lbt.models.SinusoidalVibration(frequency_hz=5, rms_nm=1)
     shaken = lbt.Truth(turbulence=None, vibrations=(line,))
     gain = lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0)
-    broken = SimpleNamespace(step=lambda _y: np.array([np.nan]), reset=lambda: None)
+    broken, turning = (
+        SimpleNamespace(step=lambda _y, u=u: np.array([u]), reset=lambda: None)
+        for u in (np.nan, 1j)
+    )
 
-    def run(controller=filters, met=truth, **counts):
-        return lambda: lbt.simulate(controller, met, hardware=hardware, **({"frames": 10} | counts))
+    def run(controller=filters, met=truth, **options):
+        options = {"frames": 10, "hardware": hardware} | options
+        return lambda: lbt.simulate(controller, met, **options)
 
     def fail(**facts):
         drop = {"unit": "m1", "start_s": 0} | facts
@@ -75,6 +79,8 @@ def test_refusals(axis_plant, sensors_design, sensors_config):
     units = "called 'm3'; there are wavefront, slow, m1"
     rows = [
         (run(broken), ProblemError, "must return 1 finite commands"),
+        (run(turning), ProblemError, "the controller's commands must be real"),
+        (run(hardware=axis_plant), ProblemError, "must be a LoopHardware.* Try tiptiltplant.hard"),
         (run("controller"), ProblemError, r"step\(y\) and reset\(\)"),
         (run(frames=0), ProblemError, "frames must be"),
         (run(cases=0), ProblemError, "cases must be"),

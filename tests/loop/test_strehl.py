@@ -125,7 +125,7 @@ def test_many_jitters_are_integrated_as_each_of_them(obstruction):
         assert alone == pytest.approx(strehl, abs=1e-14)
 
 
-def test_wrong_input_is_refused():
+def test_wrong_input_is_refused(config):
     jitter, lines = partial(lbt.strehl, imaging=CAMERA), np.zeros((2, 1, 2))
     calls = [partial(jitter, wrong) for wrong in (np.eye(3), [[1, 0], [0, -1]], [[np.nan]])]
     calls += [partial(jitter, [[1.0]], line_amplitudes_nm=[[np.inf]])]
@@ -133,7 +133,10 @@ def test_wrong_input_is_refused():
     series = np.zeros((10, 3)), np.zeros(10), [[np.nan, 1]]
     calls += [partial(series_strehl, wrong, CAMERA) for wrong in series]
     calls += [partial(lbt.Imaging, diameter_m=d, other_modes=m) for d, m in ((8, 1.2), (0, 1))]
-    require_refusals((call, ProblemError, ".") for call in calls)
+    rows = [(call, ProblemError, ".") for call in calls]
+    rows += [(partial(jitter, 50.0), ProblemError, r"got a number. Try \[\[rms_nm")]
+    rows += [(partial(lbt.strehl, [[1.0]], config), ProblemError, "imaging must .* config.imaging")]
+    require_refusals(rows)
 
 
 @pytest.mark.parametrize("obstruction", [0.0, 0.11, 0.9])

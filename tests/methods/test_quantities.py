@@ -1,12 +1,15 @@
 """Every number of a configuration has limits, at which it is computed or refused."""
 
 import contextlib
-from typing import get_args
+from functools import partial
+from typing import get_args, get_origin
 
+import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 from support.configs import GOOD, change_key, numbers_of, write_config
+from support.refusals import refused
 
 import lbt_synth as lbt
 from lbt_synth.config.samples import parse_path
@@ -23,28 +26,52 @@ SIGNED = """
 """
 
 
-def declared_numbers(annotation, bounds=(), path=""):
-    """Yield each number that a type of the schema can hold, with all its bounds."""
+def declared_numbers(annotation, bounds=(), path="", place=()):
+    """Yield each number that a type of the schema can hold, all its bounds, and its place.
+
+    The place is the section, the kind of number, and in how many lists it stands.
+    """
     bounds = (*bounds, *getattr(annotation, "__metadata__", ()))
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, field in annotation.model_fields.items():
-            yield from declared_numbers(field.annotation, tuple(field.metadata), f"{path}.{name}")
+            place = annotation, None, 0
+            declared = field.annotation, tuple(field.metadata)
+            yield from declared_numbers(*declared, f"{path}.{name}", place)
     elif annotation in (int, float):
         limits = [getattr(bound, "metadata", None) or [bound] for bound in bounds]
-        yield path, [one for some in limits for one in some]
+        yield path, [one for some in limits for one in some], (place[0], annotation, place[2])
     for argument in get_args(annotation):
-        yield from declared_numbers(argument, bounds, path)
+        lists = place[2] + (get_origin(annotation) is list)
+        yield from declared_numbers(argument, bounds, path, (*place[:2], lists))
+
+
+def require_refused_beyond(bound, name, section, kind, lists):
+    """Require that a section refuses what is just beyond a limit of a key."""
+    for relation, step in {"ge": -1, "gt": 0, "le": 1, "lt": 0}.items():
+        if hasattr(bound, relation):
+            limit = kind(getattr(bound, relation))
+            value = limit + step if kind is int else float(np.nextafter(limit, limit + step))
+            for _ in range(lists):
+                value = [value]
+            mistakes = refused(
+                partial(section.model_validate, {name: value}), ValidationError, name
+            )
+            kinds = [one["type"] for one in mistakes.errors() if one["loc"][0] == name]
+            assert len(kinds) == 1, (section, name, relation)
+            assert "than" in kinds[0], kinds
 
 
 def test_every_number_of_the_schema_has_limits():
     numbers = list(declared_numbers(FileSection))
     assert len(numbers) > 80
-    for path, bounds in numbers:
+    for path, bounds, place in numbers:
         low, high = (
             [getattr(bound, name) for bound in bounds for name in names if hasattr(bound, name)]
             for names in (("ge", "gt"), ("le", "lt"))
         )
         least, most, name = max(low), min(high), path.rpartition(".")[2]
+        for bound in bounds:
+            require_refused_beyond(bound, name, *place)
         assert most <= 1e12 or name == "seed", path
         is_signed = least == -most and name in SIGNED.split()
         assert least > 1e-13 or is_signed or (least == 0 and name in FROM_ZERO.split()), path

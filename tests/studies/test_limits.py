@@ -1,5 +1,7 @@
 """Designs against the least residuals, and beside reference designs in the truth."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from support.configs import GOOD, minimal_config, write_config
@@ -8,7 +10,7 @@ import lbt_synth as lbt
 from lbt_synth.config import Config
 from lbt_synth.design.result import model_limits
 from lbt_synth.report.figures.studies import limits_figure
-from lbt_synth.studies.limits import compare_in_truth, limits, limits_at_rate
+from lbt_synth.studies.limits import compare_in_truth, limits, limits_at_rate, say_residual
 
 
 def test_study(config, lbt_designs):
@@ -23,6 +25,11 @@ def test_study(config, lbt_designs):
         assert row.worst_nm == pytest.approx(
             study.band.rms_nm * (1 + row.above_band_limit_percent / 100)
         )
+
+
+def test_rounding_below_the_limit_is_no_minus_zero():
+    row = SimpleNamespace(residual_nm=803.19, strehl=0.14, above_limit_percent=-2e-14)
+    assert ", 0 % above the 803.2 nm" in say_residual("It", row, SimpleNamespace(rms_nm=803.19))
 
 
 def test_a_loop_of_several_sensors_has_no_distance_from_the_limit_of_one(

@@ -27,7 +27,7 @@ def full(*, frames=6, random=0, **changes):
     }
     fields |= {"frame_rate_hz": 800.0, "delay_frames": 2.25, "mirror": SHELL, "sensor_gain": 0.358}
     fields |= {"measurement_unit": "pixel", "diameter_m": 8.22, "obstruction": 0.11}
-    fields |= {"imaging_wavelength_um": 2.2}
+    fields |= {"imaging_wavelength_um": 2.2, "shown_unit": "mas"}
     return lbt.files.Telemetry(**{**fields, **changes})
 
 

@@ -57,6 +57,10 @@ def write_cards(design: Design, meta: Meta) -> dict[str, tuple[Any, str]]:
     if design.hardware is not None:
         cards["RATE_HZ"] = (design.hardware.frame_rate_hz, "[Hz] frame rate")
         cards["DELAY"] = (design.hardware.delay_frames, "[frames] total delay")
+    if design.diameter_m is not None:
+        cards["DIAMETER"] = (design.diameter_m, "[m] telescope diameter")
+    if design.shown_unit is not None:
+        cards["SHOWUNIT"] = (design.shown_unit, "in which people see the wavefront")
     cards |= {
         claim.name.upper(): (design.claims[claim.name], claim.heading)
         for claim in design.CLAIMS

@@ -141,7 +141,7 @@ def _arrays(seen: Telemetry) -> dict[str, FloatArray]:
 
 def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     """Cards of the primary header, for what the tables have no place for."""
-    own: dict[str, Any] = {"metadata": dict(seen.metadata)}
+    own: dict[str, Any] = {"metadata": dict(seen.metadata), "shown_unit": seen.shown_unit}
     if seen.mirror is not None and seen.mirror_taps is not None:
         # the standard does not say what its TFZ_NUM and TFZ_DEN of a corrector act on, nor with
         # which delay
@@ -205,7 +205,7 @@ def _system_fields(system: Any) -> dict[str, Any]:
     for datum in system.metadata:
         if datum.key == _OWN_CARD:
             own = json.loads(datum.value)
-            facts["metadata"] = own["metadata"]
+            facts |= {"metadata": own["metadata"], "shown_unit": own.get("shown_unit", "nm")}
             if "mirror" in own:
                 facts["mirror"] = PositionLoop(**own["mirror"])
     telescope = system.main_telescope

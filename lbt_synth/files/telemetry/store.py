@@ -165,7 +165,8 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
     }
     if "mirror" in meta:  # a mirror that settles at once is not in the file
         fields["mirror"] = PositionLoop(**meta["mirror"])
-    fields |= {name: meta[name] for name in FACTS}
+    usual = {"shown_unit": "nm"}  # of a file that does not say it
+    fields |= {name: (usual | meta)[name] for name in FACTS}
     return Telemetry(**fields, metadata=dict(meta["metadata"]))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.models import LoopHardware, PositionLoop
+from lbt_synth.storage.display_unit import require_unit
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
@@ -72,6 +73,7 @@ FACTS: Mapping[str, tuple[str, str, str]] = {  # with their cards in a FITS head
     "obstruction": ("OBSTRUCT", "", "central obstruction"),
     "command_unit": ("CMDUNIT", "", "of the commands"),
     "measurement_unit": ("MEASUNIT", "", "of the measurements"),
+    "shown_unit": ("SHOWUNIT", "", "in which people see the wavefront"),
 }
 
 
@@ -167,6 +169,8 @@ class Telemetry:
         Real gain of the sensor as a factor on the interaction matrix.
     command_unit, measurement_unit : str, optional
         Units; "nm" is rms of wavefront, and the only unit of length.
+    shown_unit : str, optional
+        Unit in which people see the wavefront: nm, um, mas or urad; all values stay in nm.
     diameter_m, obstruction : float, optional
         Telescope diameter [m], and that of its central obstruction as a fraction of it.
     imaging_wavelength_um : float, optional
@@ -207,6 +211,7 @@ class Telemetry:
     sensor_gain: Positive | None = None
     command_unit: str = "nm"
     measurement_unit: str = "nm"
+    shown_unit: str = "nm"
     diameter_m: Positive | None = None
     obstruction: Obstruction | None = None
     imaging_wavelength_um: Positive | None = None
@@ -216,6 +221,7 @@ class Telemetry:
         check_fields(self, metadata=_check_metadata(self.metadata))
         for name in ("command_unit", "measurement_unit"):
             _check_unit(getattr(self, name), name)
+        require_unit(self.shown_unit)
         self._check_arrays()
         if self.mirror is not None:
             if self.delay_frames is None:

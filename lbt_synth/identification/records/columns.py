@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.models import nm_per_mas
+from lbt_synth.storage.display_unit import UNITS as SHOWN
 from lbt_synth.validation import FloatArray
 
 UNITS = {
@@ -78,6 +79,12 @@ def nm_unit(
         )
     factor = unit.factor * nm_per_mas(diameter_m) ** max(unit.power, 1)
     return unit._replace(base="nm", factor=factor)
+
+
+def shown_unit(text: str) -> str:
+    """Return the unit in which people see what is measured in a unit, or in its powers."""
+    word, unit = text.strip().lower(), parse_unit(text)
+    return word if word in SHOWN or unit is None else unit.base
 
 
 def clock_factor(text: str | None, base: str) -> float:

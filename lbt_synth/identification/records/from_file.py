@@ -27,6 +27,7 @@ from lbt_synth.identification.records.columns import (
     nm_unit,
     parse_unit,
     same_unit,
+    shown_unit,
 )
 from lbt_synth.identification.records.contents import (
     CLOCKS,
@@ -214,6 +215,7 @@ def _telemetry_record(
     return replace(
         record,
         imaging_wavelength_um=telemetry.imaging_wavelength_um,
+        shown_unit=record.shown_unit if telemetry.shown_unit == "nm" else telemetry.shown_unit,
         stated_gain=tuple(gains[k] for k in chosen) if len(gains) == n else gains,
         read_with=str(telemetry.metadata.get(_READ_WITH, "")),
     )
@@ -233,6 +235,7 @@ def telemetry_of_record(record: LoopRecord) -> Telemetry:
         diameter_m=record.diameter_m,
         obstruction=record.obstruction,
         imaging_wavelength_um=record.imaging_wavelength_um,
+        shown_unit=record.shown_unit,
         metadata={name: text for name, text in stated.items() if text},
     )
 
@@ -464,6 +467,7 @@ def _build_spectrum(
     return SpectrumRecord(
         frequency_hz=clock_factor(frequency.unit, "Hz") * table[:, 0],
         density_nm2_hz=density,
+        shown_unit=shown_unit(density_unit),
         notes=tuple(dict.fromkeys(contents.notes)),
         source=source,
         **facts,

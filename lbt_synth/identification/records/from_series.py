@@ -12,11 +12,10 @@ from lbt_synth.errors import DimensionError
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
-from lbt_synth.identification.records.columns import nm_unit
+from lbt_synth.identification.records.columns import nm_unit, shown_unit
 from lbt_synth.identification.records.faults import Finding, findings_in
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
 _LARGEST_NM = 1e30  # a larger number is a filler
@@ -138,6 +137,7 @@ def loop_record(
         notes=tuple(dict.fromkeys(said)),
         diameter_m=diameter_m,
         obstruction=obstruction,
+        shown_unit=shown_unit(unit),
         source=source,
     )
 
@@ -198,9 +198,11 @@ def _note_trends(series: FloatArray, good: BoolArray) -> Iterator[str]:
     for axis, column in enumerate(series.T):
         first, last = end_scatters(column, good)
         if max(first, last) > TREND * min(first, last):
+            calm, rough = ("first", "last") if first < last else ("last", "first")
+            percent = 100 * min(first, last) / max(first, last)
             yield (
-                f"axis {axis} is not stationary: the rms difference of two frames is "
-                f"{nm_text(first)} in the first quarter and {nm_text(last)} in the last"
+                f"axis {axis} is not stationary: the rms difference of two frames in the {calm} "
+                f"quarter is {percent:.0f} % of that in the {rough}"
             )
 
 

@@ -64,6 +64,8 @@ class LoopRecord:
         What was found in the series; how they were read, and what changes with time.
     imaging_wavelength_um : float or None
         Wavelength of the image [um].
+    shown_unit : str
+        Unit in which people see the wavefront: nm, um, mas or urad.
     stated_gain, read_with : tuple of float, str
         Sensor gain of all axes, or of each, as somebody knows it; options by which the commands
         were made those that the mirror followed.
@@ -103,6 +105,7 @@ class LoopRecord:
     diameter_m: Positive | None = None
     obstruction: Obstruction | None = None
     imaging_wavelength_um: Positive | None = None
+    shown_unit: str = "nm"
     source: str = ""
     bridges: BoolArray | None = None
     stated_gain: tuple[float, ...] = ()
@@ -307,6 +310,8 @@ class SpectrumRecord:
         Periodograms that were averaged.
     diameter_m : float, optional
         Telescope diameter [m].
+    shown_unit : str, optional
+        Unit in which people see the wavefront: nm, um, mas or urad.
     source : str, optional
         Where it is from.
     notes : tuple of str, optional
@@ -332,6 +337,7 @@ class SpectrumRecord:
     frame_rate_hz: Positive | None = None
     averages: Count | None = None
     diameter_m: Positive | None = None
+    shown_unit: str = "nm"
     source: str = ""
     notes: tuple[str, ...] = ()
 

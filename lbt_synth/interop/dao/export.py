@@ -3,9 +3,9 @@
 Per mode ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)``, in rows b, then a.
 
 Poles close to z = 1 make both polynomials nearly vanish there, so that each rounding moves the loop
-by much. A robust design that this breaks is made again: a common factor with roots far from there
-makes the polynomials larger, from it the coefficients move until what the loop leaves, rounding
-included, is least, and last they are rounded one by one.
+by much. A common factor with roots far from there makes them larger and leaves the controller as it
+is. A robust design that this does not save is made again: from the factor the coefficients move
+until what the loop leaves, rounding included, is least, and last they are rounded one by one.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -45,6 +46,8 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_cop
 # step is 2^-24 to 2^-23 of the number: of normal numbers of any size the mean square is at most
 # 0.544 of what it would be if all steps were the widest, of a sinusoid 0.66.
 ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
+_USUAL = 20  # M of the computers that we know; a design of a higher order needs that order
+_WIDEST = 20  # roots of a common factor: with more, its sums round by more than it saves
 _RADIUS = 0.92  # of the roots that are added, and largest square of one that the search moves
 _ROOM = 2e-3  # of each limit, for what lies between the nodes
 _SEARCHES = 19  # at most, each with other weights of the scenarios
@@ -238,12 +241,17 @@ def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float3
     return rounded
 
 
-def _widened(exact: FloatArray) -> FloatArray:
-    """Multiply both polynomials by a factor with roots away from z = 1, up to the order."""
+def _widened(exact: FloatArray, width: int | None = None) -> FloatArray:
+    """Multiply both polynomials by a factor with roots away from z = 1, at most up to the order.
+
+    With a width, they are at roots of unity, whose places next to z = 1 the poles take.
+    """
     M = exact.size // 2
     b, a = np.trim_zeros(exact[: M + 1], "b"), np.r_[1.0, -np.trim_zeros(exact[M + 1 :], "b")]
-    spare = M + 1 - max(b.size, a.size)
-    angles = np.linspace(np.pi / 2, np.pi, spare // 2, endpoint=False)
+    longer = max(b.size, a.size)
+    spare = M + 1 - longer if width is None else min(width, M + 1 - longer)
+    gap = np.pi / 2 if width is None else np.pi * longer / (longer - 1 + spare)
+    angles = np.linspace(gap, np.pi, spare // 2, endpoint=False)
     roots = _RADIUS * np.concatenate(
         [np.exp(1j * angles), np.exp(-1j * angles), [-1] * (spare % 2)]
     )
@@ -349,10 +357,13 @@ def _coefficients(theta: FloatArray) -> FloatArray:
 _Matrix: TypeAlias = NDArray[np.float32]
 
 
-def direct_form_rows(controller: Controller, order: int) -> FloatArray:
-    """Return the matrix (2 order + 1, modes) of a controller, before it is rounded."""
-    rows = np.zeros((2 * order + 1, len(controller.C)))
-    for mode, (num, den) in enumerate(mode_polynomials(controller)):
+def direct_form_rows(controller: Controller, order: int | None = None) -> FloatArray:
+    """Return the matrix (2 M + 1, modes) of a controller of order M or, by default, of its own."""
+    polynomials = mode_polynomials(controller)
+    if order is None:
+        order = max(_USUAL, *(len(den) // 2 * 2 for _, den in polynomials))  # even
+    rows = np.zeros((2 * order + 1, len(polynomials)))
+    for mode, (num, den) in enumerate(polynomials):
         needed = len(den) - 1
         if needed > order:
             raise ProblemError(
@@ -380,8 +391,10 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
     if coupled.size:
         raise ProblemError(
             f"the modes must decouple; here measurement {coupled[0, 1] + 1} moves command "
-            f"{coupled[0, 0] + 1}. Design with --method robust, which controls each axis alone, or "
-            "use a target of matrices, such as c."
+            f"{coupled[0, 0] + 1}. For a configuration, try the method robust, which controls each "
+            "axis alone, or a target of matrices, such as c.",
+            in_python="For a record, try design_from_record(record, separate_axes=True).",
+            at_terminal="For a record, try lbt-synth auto --separate-axes.",
         )
     return [_mode_filter(system, mode, linked) for mode in range(m)]
 
@@ -463,20 +476,47 @@ class InnerLoop:
         return np.asarray(u, dtype=np.float64)
 
 
-def _round(designs: Sequence[Design], *, order: int, **_: Any) -> list[_Matrix]:
-    """Return the columns (2 M + 1, n) of each design, made again where a shaped one fails."""
-    integer(order, "order", at_least=1)
-    numbers = []
-    for design in designs:
-        exact = direct_form_rows(design.controller, order)
-        with np.errstate(over="ignore"):  # what is beyond the range becomes infinite, and refused
-            rounded = exact.astype(np.float32)
-        if design.mode_specifications:
-            checks = prove_written(design, _as_computed(design, rounded))
-            if not all(check.passed for check in checks):
-                rounded = make_again(design, exact)
-        numbers.append(rounded)
-    return numbers
+def _round(designs: Sequence[Design], *, order: int | None = None, **_: Any) -> list[_Matrix]:
+    """Return the columns (2 M + 1, n) of each design, of a higher order where 20 is too low."""
+    if order is not None:
+        integer(order, "order", at_least=1)
+    least = max(len(direct_form_rows(design.controller, order)) // 2 for design in designs)
+    shaped = any(design.mode_specifications for design in designs)
+    for M in (least,) if order or shaped else (least, least + _WIDEST):
+        pairs = [_columns(design, direct_form_rows(design.controller, M)) for design in designs]
+        if all(loss < LOSS for loss, _ in pairs):
+            break
+    ages = np.r_[0 : M + 1, 1 : M + 1]  # of what each row multiplies
+    used = max(np.max(ages[columns.any(axis=1)], initial=least) for _, columns in pairs)
+    return [columns[ages <= used] for _, columns in pairs]
+
+
+def _columns(design: Design, exact: FloatArray) -> tuple[float, _Matrix]:
+    """Return rounded columns and what they lose, with a factor where they lose too much alone."""
+    with np.errstate(over="ignore"):  # what is beyond the range becomes infinite, and refused
+        best = _loss(design, exact.astype(np.float32)), exact.astype(np.float32)
+        if design.mode_specifications and best[0] >= LOSS:
+            columns = make_again(design, exact)
+            return _loss(design, columns), columns
+        spare = min(_WIDEST, len(exact) // 2 - np.min(np.count_nonzero(exact, axis=0)) // 2)
+        for width in range(2, spare + 1) if best[0] >= LOSS else ():
+            wide = np.stack([_widened(column, width) for column in exact.T], axis=1)
+            columns = wide.astype(np.float32)
+            best = min(best, (_loss(design, columns), columns), key=itemgetter(0))
+            if best[0] < LOSS / 4:
+                break
+    return best
+
+
+def _loss(design: Design, columns: _Matrix) -> float:
+    """Return the largest loss in the proof of columns, infinite where it fails otherwise."""
+    if not np.all(np.isfinite(columns)):
+        return np.inf
+    checks = prove_written(design, _as_computed(design, columns))
+    if any(not check.passed for check in checks if check.limit != LOSS):
+        return np.inf
+    losses = [check.value for check in checks if check.limit == LOSS]
+    return float(np.nan_to_num(np.max(losses, initial=-np.inf), nan=np.inf))
 
 
 def _as_computed(design: Design, rounded: _Matrix) -> Written:
@@ -525,25 +565,31 @@ def _read(files: Mapping[Path, bytes], _: _Matrix) -> _Matrix:
 
 
 def _remark(design: Design, columns: _Matrix) -> str:
-    """Return that coefficients are not those of the gain file."""
-    exact = direct_form_rows(design.controller, len(columns) // 2)
-    if np.array_equal(columns, exact.astype(np.float32)):
-        return ""
-    return "made again for single precision; the loop keeps what the gain file promises"
+    """Return that coefficients are not those of the gain file, and an order that is unusual."""
+    M, remarks = len(columns) // 2, []
+    if M > _USUAL:
+        remarks.append(f"the matrix is for M = {M} in the configuration of the RTC")
+    if not np.array_equal(columns, direct_form_rows(design.controller, M).astype(np.float32)):
+        remarks.append(
+            "made again for single precision; the loop keeps what the gain file promises"
+            if design.mode_specifications
+            else "both polynomials have a factor more, for single precision; it cancels"
+        )
+    return "; ".join(remarks)
 
 
 TARGET = Target(
     precision="single",
-    options={"order": 20, "modes": None, "other_gain": None},
+    options={"order": None, "modes": None, "other_gain": None},
     round=_round,
     write=_write,
     read=_read,
     computed=_as_computed,
     start=InnerLoop,
     join=_join,
-    facts=lambda _, **options: {"sign": _SIGN},
+    facts=lambda matrix, **_: {"sign": _SIGN, "order": len(matrix) // 2},
     remark=_remark,
-    hint="Give an even order, design with fewer states or less accurate models, or use a target in "
-    "double precision.",
+    hint="Give a higher, even order, design with fewer states or less accurate models, or use a "
+    "target in double precision.",
     endings=(".npy",),
 )

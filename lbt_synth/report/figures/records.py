@@ -305,7 +305,7 @@ def _draw_cumulative(axes: Axes, axis: IdentifiedAxis, residuals: dict[str, Floa
     if axis.data.closed:
         densities["measurement that ran"] = (axis.data.measured / axis.sensor_gain**2, 2)
     for look, (name, density) in enumerate(residuals.items(), start=3):
-        densities[f"residual, {name}"] = (density, look)
+        densities[f"residual by the fit, {name}"] = (density, look)
     rms = ("rms up to the frequency", "nm")
     _, factor = name_axes(axes, FREQUENCY, rms, xscale="log", yscale="log")
     totals, step = [], np.gradient(f)

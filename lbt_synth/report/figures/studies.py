@@ -27,7 +27,7 @@ from lbt_synth.report.draw import (
     name_axes,
 )
 from lbt_synth.report.figures.loops import draw_design
-from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.display_unit import nm_text, own_display_unit
 from lbt_synth.storage.rows import Facts
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap
@@ -311,11 +311,12 @@ def end_to_end_figure(run: EndToEndRun) -> Figure:
         draw_map([image], [(position_mas, position_mas, values)], "intensity / peak", log=True)
         image.set(xlim=(-reach_mas, reach_mas), ylim=(-reach_mas, reach_mas))
         mode, residual = ("mode (1 tip, 2 tilt)", ""), ("residual", "nm rms")
-        _, factor = name_axes(modes, mode, residual, "all modes", xscale="log", yscale="log")
+        with own_display_unit():  # most modes are no tilt
+            name_axes(modes, mode, residual, "all modes", xscale="log", yscale="log")
         numbers = np.arange(1.0, run.setup.modes + 1)
         thin = line_style(0, linewidth=0.8)
-        modes.plot(numbers, factor * run.rms_nm, label="_residual", **thin)
-        name_axes(series, ("time", "s"), ("residual", "nm rms wavefront"), "tip and tilt")
+        modes.plot(numbers, run.rms_nm, label="_residual", **thin)
+        _, factor = name_axes(series, ("time", "s"), residual, "tip and tilt")
         for axis, name in enumerate(("tip", "tilt")):
             label = f"{name}, {nm_text(run.rms_nm[axis], '.0f', unit='nm rms')}"
             style = line_style(axis, dash=0, linewidth=0.8)

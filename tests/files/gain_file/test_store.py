@@ -62,12 +62,14 @@ def test_records_agree_to_the_last_digits():
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "sensors"])
 def test_a_fits_file_speaks_to_people_and_drives_a_foreign_filter(tmp_path, name):
-    design = original(name)
+    design = replace(original(name), diameter_m=8.22, shown_unit="mas")
     path = lbt.save_gain(tmp_path / "g.fits", design)
+    loaded = lbt.load_gain(path)
+    assert (loaded.diameter_m, loaded.shown_unit) == (8.22, "mas")
     header, inputs = fits.getheader(path), design.controller.B.shape[-1]
     expected = {"METHOD": design.method, "RATE_HZ": 800, "DELAY": 2.5, "NEWSTATE": True}
     expected |= {} if name == "integrator" else {"RMS": pytest.approx(design.rms)}
-    expected["NFILTER"] = inputs
+    expected |= {"NFILTER": inputs, "DIAMETER": 8.22, "SHOWUNIT": "mas"}
     assert {key: header[key] for key in expected} == expected
     if name == "sensors":  # its matrices change from frame to frame
         return

@@ -103,6 +103,7 @@ DIGEST = "does not match its digest"
         (lambda a, m: m.update(frame_rate_hz="fast"), "frame_rate_hz must be a number"),
         (lambda a, m: m.update(metadata=3), "inconsistent"),
         (lambda a, m: m.update(metadata={"a": [1]}), "metadata must hold"),
+        (lambda a, m: m.update(shown_unit="ell"), "shown_unit must be one of nm, um, mas, urad"),
     ],
 )
 def test_edited_files_are_refused(tmp_path, change, text):
@@ -117,12 +118,20 @@ def test_edited_files_are_refused(tmp_path, change, text):
     refused(lambda: load_telemetry(path), TelemetryError, text)
 
 
+def test_a_file_that_says_no_unit_is_seen_in_nm(tmp_path):
+    arrays, meta = store.pack(full())
+    assert meta.pop("shown_unit") == "mas"
+    meta["digest"] = archive.digest(arrays, meta)
+    (tmp_path / "t.npz").write_bytes(archive.npz_bytes(arrays, json.dumps(meta)))
+    assert same(full(shown_unit="nm"), load_telemetry(tmp_path / "t.npz"))
+
+
 def test_the_fits_file_explains_itself(tmp_path):
     seen = full()
     with fits.open(save_telemetry(tmp_path / "t.fits", seen)) as units:
         headers = {unit.name: unit.header for unit in units}
         facts = {"LBTTELEM": 2, "RATE_HZ": 800, "DELAY": 2.25, "SENSGAIN": 0.358}
-        facts |= {"DIAMETER": 8.22, "WAVELEN": 2.2, "TIMING": seen.convention}
+        facts |= {"DIAMETER": 8.22, "WAVELEN": 2.2, "SHOWUNIT": "mas", "TIMING": seen.convention}
         assert {key: units[0].header[key] for key in facts} == facts
         axes = {"BUNIT": "pixel", "CTYPE2": "FRAME", "NAXIS2": 6, "CTYPE1": "MEASUREMENT"}
         assert axes.items() | {("NAXIS1", 3)} <= {*headers["MEASURE"].items()}

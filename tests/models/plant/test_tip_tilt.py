@@ -206,6 +206,7 @@ def test_a_prediction_further_ahead_has_the_same_readings(steps):
 def test_wrong_parts_are_refused(plant):
     line = lbt.Vibration(frequency_hz=9, damping=0.1, rms_nm=1)
     unequal = {"sensor_matrix": np.eye(3), "influence_matrix": np.eye(2)}
+    blind = {"sensor_matrix": [[1 / 3, 0.1]], "influence_matrix": [[0.3], [-1.0]]}
     rows = [
         ({"noise_nm": 0.0}, "noise_nm must be above 0"),
         ({"noise_nm": [[1.0, 2.0], [0.0, 1.0]]}, "noise_nm must be symmetric"),
@@ -214,11 +215,16 @@ def test_wrong_parts_are_refused(plant):
         ({"delay_frames": 20.5}, "delay_frames must be at most 20; got 20.5"),
         ({"sensor_gain": 0}, "sensor_gain must be above 0"),
         (unequal, "to match sensor_matrix"),
+        (blind, "must see something that the mirror moves"),
         ({"sensor_matrix": [[np.nan, 0], [0, 1]]}, "sensor_matrix must be finite"),
         ({"turbulence": [AR1] * 3}, r"one per mode \(2\); got 3"),
         ({"turbulence": replace(AR1, frame_rate_hz=500)}, "must be sampled at the loop's 800 Hz"),
         ({"vibrations": [replace(line, direction=(1,))]}, "must have 2 components"),
         ({"vibrations": [replace(line, frequency_hz=450)]}, "below the Nyquist"),
+        ({"vibrations": line}, "vibrations must be a list; got Vibration"),
+        ({"vibrations": [1]}, "each vibration must be a Vibration; got int"),
+        ({"turbulence": None}, "turbulence must be an ARModel, .* got NoneType"),
+        ({"noise_nm": 1e-200}, "is singular. Every measurement needs noise"),
     ]
     require_refusals((partial(small_plant, **c), ProblemError, words) for c, words in rows)
     suite = SensorSuite(sensors=(replace(CHANNEL, rate_hz=RATE),))
