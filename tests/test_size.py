@@ -14,17 +14,17 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3207,
-    "config": 1627,
-    "design": 6001,
+    "cli": 3217,
+    "config": 1629,
+    "design": 6028,
     "files": 1263,
-    "identification": 8896,
-    "interop": 3727,
-    "linear": 4756,
+    "identification": 8956,
+    "interop": 3732,
+    "linear": 4766,
     "loop": 3982,
-    "methods": 784,
-    "models": 3761,
-    "report": 3352,
+    "methods": 803,
+    "models": 3771,
+    "report": 3351,
     "storage": 1134,
     "studies": 3200,
     "errors, validation": 555,
@@ -32,10 +32,10 @@ LINES = {
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
-    "tuned constants": 501,
-    "lines of tests": 24886,
+    "tuned constants": 502,
+    "lines of tests": 25007,
     "lines of benchmarks": 3998,
-    "words of docs": 60087,
+    "words of docs": 60055,
 }
 
 

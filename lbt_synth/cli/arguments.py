@@ -179,6 +179,7 @@ _TABLE = """
     known judged accelerometers
     >
     --method | @record_methods | default: kalman, unless another quick one leaves less
+    --separate-axes | switch | no axis reads the other, for one filter per mode (dao)
     -o --output | required | gain file (.fits or .npz); the configuration of one record goes beside
         it (.yaml)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.

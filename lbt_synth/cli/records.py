@@ -108,6 +108,7 @@ def run_auto(arguments: Namespace) -> Report:
             imaging=imaging,
             accept_record=arguments.accept_record,
             command_scale_known=_knows_scale(record),
+            separate_axes=arguments.separate_axes,
             accelerations=values,
             channels=channels,
             progress=count,
@@ -160,6 +161,7 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
             progress=count,
             accept_record=arguments.accept_record,
             command_scale_known=all(map(_knows_scale, nights.values())),
+            separate_axes=arguments.separate_axes,
             lowest_line_hz=arguments.lowest_line_hz,
             most_lines=arguments.most_lines,
         )

@@ -223,19 +223,46 @@ def reduce_filter(
     return parameter, 0.0
 
 
+def _reduce_groups(
+    parameter: Controller,
+    readings: FloatArray,
+    residual_nm2: float,
+    groups: Sequence[Sequence[int]],
+) -> tuple[Controller, float]:
+    """Reduce the filter of each group of axes, which reads no measurement of the others."""
+    axes, filters, lost_nm = range(parameter.C.shape[0]), list[Controller](), list[float]()
+    for group in groups:
+        B = parameter.B.copy()
+        B[:, [axis for axis in axes if axis not in group]] = 0.0
+        C, D = parameter.C[list(group)], parameter.D[list(group)]
+        few, lost = reduce_filter(
+            replace(parameter, B=B, C=C, D=D), readings, residual_nm2 / len(groups)
+        )
+        filters.append(few)
+        lost_nm.append(lost)
+    joint = replace(
+        parameter,
+        A=block_diag(*(few.A for few in filters)),
+        B=np.vstack([few.B for few in filters]),
+        C=block_diag(*(few.C for few in filters)),
+    )
+    return joint, float(np.linalg.norm(lost_nm))
+
+
 def predictor_design(
     hardware: LoopHardware,
     filters: Sequence[Controller],
     readings: FloatArray,
     residual_nm2: float,
     *,
+    groups: Sequence[Sequence[int]],
     what: str,
     **claims: float,
 ) -> PredictorDesign:
-    """Reduce the filters of a record, and certify the design of them."""
+    """Reduce the filters of a record, for each group of axes, and certify the design of them."""
     if len(filters) != 1 + bool(hardware.suite.sensors):
         raise ProblemError("a predictor needs one filter, and a fall-back for other sensors.")
-    pairs = [reduce_filter(p, readings[:, : p.B.shape[1]], residual_nm2) for p in filters]
+    pairs = [_reduce_groups(p, readings[:, : p.B.shape[1]], residual_nm2, groups) for p in filters]
     short, lost = zip(*pairs, strict=True)
     status = f"{what}; reduced by {lost[0]:.2g} nm"
     design = PredictorDesign(

@@ -23,6 +23,7 @@ from lbt_synth.validation import (
 )
 
 LONGEST_HORIZON = 100  # samples
+_EXTREME = 1e75  # of an entry, and one over a noise: products of four of them are numbers
 _NOISE_FREE = 1e-9  # singular value of readings whose noise is of size one that counts as zero
 
 
@@ -61,6 +62,8 @@ class EstimationProblem(LinearSystem):
         If sizes clash, or no measurement is ever read.
     NonFiniteError
         If an entry is NaN or infinite.
+    ProblemError
+        If an entry is above 1e75: products of the matrices would not be numbers.
     DefinitenessError
         If ``D D'`` is singular: some combination of measurements is free of noise.
 
@@ -99,13 +102,20 @@ class EstimationProblem(LinearSystem):
             )
         read = np.broadcast_to(read, (self.period, q)).copy()
         set_fields(self, L=L, read=read_only(read))
-        self._require_noise()
+        self._require_computable()
 
-    def _require_noise(self) -> None:
-        """Refuse readings of which some combination is free of noise, whatever their units."""
+    def _require_computable(self) -> None:
+        """Refuse entries beyond all units, and readings with a combination free of noise."""
+        for name in "ABCDL":
+            largest = np.max(np.abs(getattr(self, name)), initial=0.0)
+            if largest > _EXTREME:
+                raise ProblemError(
+                    f"the entries of {name} must be at most {_EXTREME:g}; got {largest:g}. Check "
+                    "the units."
+                )
         for t in range(self.period):
             D = self.read_parts(t)[3]
-            sizes = np.maximum(np.linalg.norm(D, axis=1, keepdims=True), 1e-300)
+            sizes = np.maximum(np.linalg.norm(D, axis=1, keepdims=True), 1 / _EXTREME)
             if np.linalg.matrix_rank(D / sizes, tol=_NOISE_FREE) < len(D):
                 where = f" at phase {t}" if self.period > 1 else ""
                 raise DefinitenessError(

@@ -27,6 +27,7 @@ from lbt_synth.validation import (
     frozen_copy,
     number,
     one_or_each,
+    sequence,
 )
 
 # spectra with the modes that have them, vibrations, and a root of the covariance of the noise
@@ -101,11 +102,12 @@ class Truth(Summarised):
                     "turbulence must have a method psd(frequency_hz), or be None, or a sequence "
                     f"of these, one per mode; got {type(part).__name__}."
                 )
-        for each in self.vibrations:
-            if not isinstance(each, TrueVibration):
+        vibrations = sequence(self.vibrations, "vibrations")
+        for line in vibrations:
+            if not isinstance(line, TrueVibration):
                 raise ProblemError(
                     "vibrations must be Vibration or SinusoidalVibration; got "
-                    f"{type(each).__name__}."
+                    f"{type(line).__name__}."
                 )
         noise, errors = one_or_each(self.noise_nm, "noise_nm", at_least=0), self.frequency_errors_hz
         if errors is not None:
@@ -116,7 +118,7 @@ class Truth(Summarised):
         check_fields(
             self,
             turbulence=parts if isinstance(turbulence, Sequence) else turbulence,
-            vibrations=tuple(self.vibrations),
+            vibrations=vibrations,
             noise_nm=float(noise) if noise.ndim == 0 else noise,
             frequency_errors_hz=errors,
             motions=tuple(self.motions) if any(self.motions) else ({},) * len(self.vibrations),

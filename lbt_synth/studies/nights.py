@@ -114,8 +114,8 @@ def design_from_nights(
     progress : callable, optional
         Called with 1 after each of 3 steps a night.
     **options
-        ``accept_record``, ``command_scale_known``, ``lowest_line_hz`` and ``most_lines`` of
-        :func:`design_from_record`.
+        ``accept_record``, ``command_scale_known``, ``separate_axes``, ``lowest_line_hz`` and
+        ``most_lines`` of :func:`design_from_record`.
 
     Returns
     -------

@@ -96,27 +96,21 @@ def test_a_record_is_read_once(tmp_path, capsys):
         run_done(capsys, "identify", *options, "-o", model, "--no-figure")
         models.append(model.read_text().split("\n", 1)[1])
     assert models[0].replace("night.csv", "") == models[1].replace("night.fits", "")
-    words = ("auto", night, "-o", tmp_path / "b.fits", "--no-figure", "--method", "kalman")
+    gain, other = tmp_path / "tt.fits", tmp_path / "k.fits"
+    words = ("auto", night, "-o", gain, "--no-figure", "--method", "kalman")
     options = "--command-sign -1 --command-scale 2"
     read = f"the commands of the record were read with {options}"
     assert read in run_json(capsys, *words)["assumptions"][0]
     assert "The record is sound" in run_done(capsys, "diagnose", night)
-    assert options in run_done(capsys, "telemetry", "--verbose", night)
-    assert "\nunits: mas\n" in (tmp_path / "b.yaml").read_text()
-    gain, other = tmp_path / "b.fits", tmp_path / "c.fits"
-    run_done(capsys, "design", tmp_path / "b.yaml", "--method", "kalman", "-o", other)
+    text = run_done(capsys, "telemetry", "--verbose", night)
+    assert options in text
+    assert re.search(r"commands +6000 x 2 +frame, command +mas ", text)
+    assert "\nunits: mas\n" in model.read_text()
+    run_done(capsys, "design", model, "--method", "kalman", "-o", other)
     shown = [("show", gain), ("show", other), ("plot", "step", gain), ("diagnose", night, gain)]
-    for words in (
-        *shown,
-        ("rehearse", night, gain, "--for", "c"),
-    ):  # in mas, unless nm is asked for
-        option = "--unit" if words[0] in ("show", "plot") else "--show-unit"
+    for words in (*shown, ("rehearse", night, gain, "--for", "c")):
         assert not re.search(r"\bnm\b", run_done(capsys, *words, "--verbose")), words
-        in_nm = run_done(capsys, *words, option, "nm", "--verbose")
-        assert re.search(r"\bnm\b", in_nm) or words[0] == "plot", words
-    assert re.search(
-        r"commands +6000 x 2 +frame, command +mas ", run_done(capsys, "telemetry", night)
-    )
+    assert re.search(r"\[nm\]", run_done(capsys, "diagnose", night, "--show-unit", "nm"))
 
 
 def test_an_open_loop_is_read_once(tmp_path, capsys):

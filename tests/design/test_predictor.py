@@ -112,7 +112,8 @@ def test_a_channel_that_fails_takes_the_fallback_without_a_jump() -> None:
 
 
 def test_a_predictor_needs_a_record(config) -> None:
-    single = partial(predictor.predictor_design, HEARING, [BASE], readings(), 1.0, what="test")
+    what = {"groups": [[0, 1]], "what": "test"}
+    single = partial(predictor.predictor_design, HEARING, [BASE], readings(), 1.0, **what)
     refused(single, ProblemError, "one filter, and a fall-back")
     design = partial(config.design, "predictor")
     refused(design, ProblemError, "the method predictor is made of a record")

@@ -26,4 +26,6 @@ def readings(channels=3, frames=4000):
 
 def made(**claims):
     filters = [regression_filter(PATH, BASE, coefficients(n)) for n in (7, 4)]
-    return predictor_design(HEARING, filters, readings(), 100.0, what="test", **claims)
+    return predictor_design(
+        HEARING, filters, readings(), 100.0, groups=[[0, 1]], what="test", **claims
+    )

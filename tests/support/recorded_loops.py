@@ -1,5 +1,7 @@
 """Recorded loops of an integrator, for the tests of identification."""
 
+from functools import cache
+
 import numpy as np
 from scipy.signal import lfilter
 
@@ -81,6 +83,13 @@ def hidden_resonance_record(seed=63):
     )
     truth = {"turbulence": _air(1.381, 23.6, 23.1), "noise_nm": 2.82, "sensor_gain": 0.995}
     return _directed_record(1000.0, 0.2266, resonances, seed, **truth)
+
+
+@cache
+def slanted_record():
+    """Return the loop of two axes that share a line at 30 degrees."""
+    line = (20.0, 0.005, 100.0, 30.0)
+    return _directed_record(RATE, 0.3, (line,), 1, turbulence=slow(), noise_nm=6.0)
 
 
 def drifting_record(seed=337, *, gain=0.4062):

@@ -205,7 +205,7 @@ def _system_fields(system: Any) -> dict[str, Any]:
     for datum in system.metadata:
         if datum.key == _OWN_CARD:
             own = json.loads(datum.value)
-            facts |= {name: own[name] for name in ("metadata", "shown_unit") if name in own}
+            facts |= {"metadata": own["metadata"], "shown_unit": own.get("shown_unit", "nm")}
             if "mirror" in own:
                 facts["mirror"] = PositionLoop(**own["mirror"])
     telescope = system.main_telescope

@@ -241,6 +241,14 @@ class IdentifiedModel(Summarised):
             mirror=self.mirror,
         )
 
+    def separated(self) -> IdentifiedModel:
+        """Return the model in which each shared line is one line of each axis, independent."""
+        axes = []
+        for axis in self.axes:
+            parts = (replace(x, direction=None, direction_error_deg=None) for x in axis.parts)
+            axes.append(replace(axis, parts=tuple(parts)))
+        return replace(self, axes=tuple(axes), shared=())
+
     def truth(self) -> Truth:
         """Return the same as the truth of an analysis, for :attr:`hardware`."""
         return Truth(

@@ -231,9 +231,10 @@ def design_inputs(
     channels: Channels | None = None,
     added_nm: FloatArray | float = 0.0,
     penalty: float | None = None,
+    separate: bool = False,
 ) -> DesignInputs:
     """Return what a method makes a design of: a model with more noise, its record and channels."""
-    beside: dict[str, Any] = {"channels": channels, "added_nm": added_nm}
+    beside: dict[str, Any] = {"channels": channels, "added_nm": added_nm, "separate": separate}
     return DesignInputs(
         plant=noisier(model, added_nm).plant(),
         predict=lambda: regress(record, model, **beside).design(penalty),

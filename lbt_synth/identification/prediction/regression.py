@@ -129,6 +129,8 @@ class Regression:
         Moments of consecutive parts of the record.
     scales : (m,) ndarray
         Changes of each signal from frame to frame, rms.
+    groups : tuple of tuple of int
+        Axes whose filters read each other: all of them, or each by itself.
     """
 
     hardware: LoopHardware
@@ -136,6 +138,7 @@ class Regression:
     readings: FloatArray
     parts: tuple[Moments, ...]
     scales: FloatArray
+    groups: tuple[tuple[int, ...], ...]
 
     @property
     def own(self) -> int:
@@ -146,6 +149,11 @@ class Regression:
         """Return where some signals stand in the moments, all lags."""
         rows = np.arange(TAPS)[:, None] * len(self.scales) + np.array(signals)
         return np.asarray(rows.ravel())
+
+    def read_by(self, axes: Sequence[int], signals: Sequence[int]) -> list[int]:
+        """Return which of some signals a group of axes reads: its own, and channels."""
+        modes = self.hardware.modes
+        return [signal for signal in signals if signal >= self.own or signal % modes in axes]
 
     def _weights(self, signals: Sequence[int]) -> FloatArray:
         """Return the matrix of the penalty of some signals: of age and offsets of channels, too."""
@@ -173,7 +181,14 @@ class Regression:
 
     def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
         """Return the coefficients of some signals, (taps m, n), for moments of these."""
-        return np.asarray(cho_solve(self._factor(signals, penalty, moments)[1], moments.products))
+        coefficients = np.zeros_like(moments.products)
+        for axes in self.groups:
+            read = self.read_by(axes, signals)
+            places, columns = np.flatnonzero(np.tile(np.isin(signals, read), TAPS)), np.array(axes)
+            chosen = moments.chosen(places)
+            solved = cho_solve(self._factor(read, penalty, chosen)[1], chosen.products[:, columns])
+            coefficients[np.ix_(places, columns)] = solved
+        return coefficients
 
     def fit_share(self, penalty: float) -> float:
         """Return by which share of what it leaves the filter of all signals is worse unseen.
@@ -181,9 +196,13 @@ class Regression:
         Its effective number of coefficients over the frames: what their errors add (H. Akaike, Ann.
         Inst. Statist. Math. 21, 243 (1969), doi:10.1007/BF02532251).
         """
-        weights, factor = self._factor(range(len(self.scales)), penalty, self.whole)
-        inverse = cho_solve(factor, np.eye(len(weights)))
-        return float(len(weights) - np.sum(inverse * weights)) / self.whole.frames
+        counts, left_nm2 = [], [np.sum(self.whole.targets[list(axes)]) for axes in self.groups]
+        for axes in self.groups:
+            read = self.read_by(axes, range(len(self.scales)))
+            weights, factor = self._factor(read, penalty, self.whole.chosen(self.places(read)))
+            inverse = cho_solve(factor, np.eye(len(weights)))
+            counts.append(len(weights) - np.sum(inverse * weights))
+        return float(np.average(counts, weights=left_nm2)) / self.whole.frames
 
     @cached_property
     def whole(self) -> Moments:
@@ -224,6 +243,7 @@ class Regression:
             filters,
             self.readings,
             left[0],
+            groups=self.groups,
             what=f"penalty {penalty:.0e}",
             fit_share=self.fit_share(penalty),
         )
@@ -235,8 +255,11 @@ def regress(
     *,
     channels: Channels | None = None,
     added_nm: FloatArray | float = 0.0,
+    separate: bool = False,
 ) -> Regression:
     """Collect what a record tells of its future, beside its model, of which the base is the filter.
+
+    If they are separate, as in the model, no axis reads the measurements of the other.
 
     More noise than the model's, as phase of each axis, is added as that of a run without any
     disturbance, of which nothing is to be corrected.
@@ -251,7 +274,7 @@ def regress(
     late, taps = held_fraction(path), path.mirror_taps
     if late:  # the target of a command is the mean phase of its hold, which lies in two frames
         taps = np.eye(1, path.mirror_system.lead + 1, path.mirror_system.lead)[0]
-    first = max(TAPS + len(taps), settle_frames(path))
+    first, axes = max(TAPS + len(taps), settle_frames(path)), range(path.modes)
     beside = np.zeros((record.frames, 0)) if channels is None else channels.values
 
     def lay(series: FloatArray, runs: Stretches, beside: FloatArray) -> tuple[FloatArray, ...]:
@@ -294,6 +317,7 @@ def regress(
         readings=gather(readings, kept),
         parts=tuple(moments),
         scales=np.where(scales > 0, scales, 1.0),
+        groups=tuple((i,) for i in axes) if separate else (tuple(axes),),
     )
 
 

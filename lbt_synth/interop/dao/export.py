@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -46,7 +47,7 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_cop
 # 0.544 of what it would be if all steps were the widest, of a sinusoid 0.66.
 ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
 _USUAL = 20  # M of the computers that we know; a design of a higher order needs that order
-_WIDEST = 12  # roots of a common factor: with more, its sums round by more than it saves
+_WIDEST = 20  # roots of a common factor: with more, its sums round by more than it saves
 _RADIUS = 0.92  # of the roots that are added, and largest square of one that the search moves
 _ROOM = 2e-3  # of each limit, for what lies between the nodes
 _SEARCHES = 19  # at most, each with other weights of the scenarios
@@ -240,13 +241,17 @@ def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float3
     return rounded
 
 
-def _widened(exact: FloatArray, most: int | None = None) -> FloatArray:
-    """Multiply both polynomials by a factor with roots away from z = 1, at most up to the order."""
+def _widened(exact: FloatArray, width: int | None = None) -> FloatArray:
+    """Multiply both polynomials by a factor with roots away from z = 1, at most up to the order.
+
+    With a width, they are at roots of unity, whose places next to z = 1 the poles take.
+    """
     M = exact.size // 2
     b, a = np.trim_zeros(exact[: M + 1], "b"), np.r_[1.0, -np.trim_zeros(exact[M + 1 :], "b")]
-    spare = M + 1 - max(b.size, a.size)
-    spare = spare if most is None else min(most, spare)
-    angles = np.linspace(np.pi / 2, np.pi, spare // 2, endpoint=False)
+    longer = max(b.size, a.size)
+    spare = M + 1 - longer if width is None else min(width, M + 1 - longer)
+    gap = np.pi / 2 if width is None else np.pi * longer / (longer - 1 + spare)
+    angles = np.linspace(gap, np.pi, spare // 2, endpoint=False)
     roots = _RADIUS * np.concatenate(
         [np.exp(1j * angles), np.exp(-1j * angles), [-1] * (spare % 2)]
     )
@@ -353,13 +358,10 @@ _Matrix: TypeAlias = NDArray[np.float32]
 
 
 def direct_form_rows(controller: Controller, order: int | None = None) -> FloatArray:
-    """Return the matrix (2 M + 1, modes) of a controller, before it is rounded.
-
-    M is the order, by default 20, or what the controller needs.
-    """
+    """Return the matrix (2 M + 1, modes) of a controller of order M or, by default, of its own."""
     polynomials = mode_polynomials(controller)
     if order is None:
-        order = max(_USUAL, *(len(den) - 1 for _, den in polynomials))
+        order = max(_USUAL, *(len(den) // 2 * 2 for _, den in polynomials))  # even
     rows = np.zeros((2 * order + 1, len(polynomials)))
     for mode, (num, den) in enumerate(polynomials):
         needed = len(den) - 1
@@ -478,27 +480,32 @@ def _round(designs: Sequence[Design], *, order: int | None = None, **_: Any) -> 
     """Return the columns (2 M + 1, n) of each design, of a higher order where 20 is too low."""
     if order is not None:
         integer(order, "order", at_least=1)
-    M = max(len(direct_form_rows(design.controller, order)) // 2 for design in designs)
-    numbers = [_columns(design, direct_form_rows(design.controller, M)) for design in designs]
-    pairs = zip(designs, numbers, strict=True)
-    if order is None and not all(_loss(*pair) < LOSS for pair in pairs):
-        return _round(designs, order=M + _WIDEST)
-    return numbers
+    least = max(len(direct_form_rows(design.controller, order)) // 2 for design in designs)
+    shaped = any(design.mode_specifications for design in designs)
+    for M in (least,) if order or shaped else (least, least + _WIDEST):
+        pairs = [_columns(design, direct_form_rows(design.controller, M)) for design in designs]
+        if all(loss < LOSS for loss, _ in pairs):
+            break
+    ages = np.r_[0 : M + 1, 1 : M + 1]  # of what each row multiplies
+    used = max(np.max(ages[columns.any(axis=1)], initial=least) for _, columns in pairs)
+    return [columns[ages <= used] for _, columns in pairs]
 
 
-def _columns(design: Design, exact: FloatArray) -> _Matrix:
-    """Return rounded columns; where these break the loop, with the factor that loses least."""
+def _columns(design: Design, exact: FloatArray) -> tuple[float, _Matrix]:
+    """Return rounded columns and what they lose, with a factor where they lose too much alone."""
     with np.errstate(over="ignore"):  # what is beyond the range becomes infinite, and refused
-        rounded = exact.astype(np.float32)
-        if _loss(design, rounded) < LOSS:
-            return rounded
-        if design.mode_specifications:
-            return make_again(design, exact)
-        made = [
-            np.stack([_widened(column, width) for column in exact.T], axis=1).astype(np.float32)
-            for width in range(1, _WIDEST + 1)
-        ]
-    return min([rounded, *made], key=lambda columns: _loss(design, columns))
+        best = _loss(design, exact.astype(np.float32)), exact.astype(np.float32)
+        if design.mode_specifications and best[0] >= LOSS:
+            columns = make_again(design, exact)
+            return _loss(design, columns), columns
+        spare = min(_WIDEST, len(exact) // 2 - np.min(np.count_nonzero(exact, axis=0)) // 2)
+        for width in range(2, spare + 1) if best[0] >= LOSS else ():
+            wide = np.stack([_widened(column, width) for column in exact.T], axis=1)
+            columns = wide.astype(np.float32)
+            best = min(best, (_loss(design, columns), columns), key=itemgetter(0))
+            if best[0] < LOSS / 4:
+                break
+    return best
 
 
 def _loss(design: Design, columns: _Matrix) -> float:

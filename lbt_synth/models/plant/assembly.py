@@ -14,14 +14,14 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.errors import DimensionError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.loop_hardware import LoopHardware, require_loop_rate
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficient_rows, section_drives
 from lbt_synth.models.sensor_suite import WHOLE, Motions, checked_motions, period_frames
 from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.vibration import Vibration, checked_direction
-from lbt_synth.validation import FloatArray, set_fields
+from lbt_synth.validation import FloatArray, require_instance, set_fields
 
 # of a system of N phases, A (N, h, h), B (N, h, n) and C (N, q, h), which may have no state
 Memory: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
@@ -41,6 +41,12 @@ class PlantParts:
 
     def __post_init__(self) -> None:
         n = self.hardware.modes
+        for model in self.turbulence:
+            if not isinstance(model, ARModel):
+                raise ProblemError(
+                    f"turbulence must be an ARModel, or one per mode; got {type(model).__name__}.",
+                    in_python="For an Atmosphere try ar1_turbulence(air, frame_rate_hz=...).",
+                )
         if len(self.turbulence) != n or any(m.coefficients.ndim > 1 for m in self.turbulence):
             raise DimensionError(
                 f"turbulence must be one ARModel, or one per mode ({n}); got "
@@ -49,7 +55,7 @@ class PlantParts:
         for model in self.turbulence:
             require_loop_rate(model.frame_rate_hz, self.hardware)
         for line in self.vibrations:
-            checked_direction(line, self.hardware)
+            checked_direction(require_instance(line, Vibration, "each vibration"), self.hardware)
         lines = len(self.vibrations)
         motions = self.motions if any(self.motions) else ({},) * lines
         set_fields(self, motions=checked_motions(motions, self.hardware.suite, lines))

@@ -31,7 +31,7 @@ from lbt_synth.models.spectra import ARModel, spectrum_groups
 from lbt_synth.models.truth import Entering
 from lbt_synth.models.vibration import Vibration, spread_lines
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, integer, one_or_each, require_instance
+from lbt_synth.validation import FloatArray, integer, one_or_each, require_instance, sequence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -283,14 +283,16 @@ def tip_tilt_plant(
     if np.any(gains != 1):
         sensor = np.reshape(gains, (-1, 1)) * hardware.sensor
         hardware = replace(hardware, sensor_matrix=sensor)
-    models = turbulence.separate() if isinstance(turbulence, ARModel) else tuple(turbulence)
-    if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim == 1:
-        models *= hardware.modes
+    models = turbulence if isinstance(turbulence, list | tuple) else (turbulence,)
+    if isinstance(turbulence, ARModel):
+        models = turbulence.separate()
+        if turbulence.coefficients.ndim == 1:
+            models *= hardware.modes
     return assemble(
         PlantParts(
             hardware=hardware,
-            turbulence=models,
-            vibrations=tuple(vibrations),
+            turbulence=tuple(models),
+            vibrations=sequence(vibrations, "vibrations"),
             noise_factor=noise_factor(noise_nm, hardware.n_measurements),
         )
     )

@@ -316,8 +316,7 @@ def end_to_end_figure(run: EndToEndRun) -> Figure:
         numbers = np.arange(1.0, run.setup.modes + 1)
         thin = line_style(0, linewidth=0.8)
         modes.plot(numbers, run.rms_nm, label="_residual", **thin)
-        wavefront = ("residual", "nm rms wavefront")
-        _, factor = name_axes(series, ("time", "s"), wavefront, "tip and tilt")
+        _, factor = name_axes(series, ("time", "s"), residual, "tip and tilt")
         for axis, name in enumerate(("tip", "tilt")):
             label = f"{name}, {nm_text(run.rms_nm[axis], '.0f', unit='nm rms')}"
             style = line_style(axis, dash=0, linewidth=0.8)

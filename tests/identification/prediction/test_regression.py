@@ -5,6 +5,7 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
+from support.recorded_loops import slanted_record
 from support.refusals import refused
 from support.structures import structure
 
@@ -126,6 +127,35 @@ def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
     half = replace(fit, parts=fit.parts[:3]).fit_share(penalty)
     assert apart == pytest.approx(4 * half * fit.whole.left(whole), rel=0.3)
     assert 0 < predictor(channels=True).claims["fit_share"] < 0.1
+
+
+def test_separate_axes_are_regressed_as_each_alone() -> None:
+    """Against the record of each axis by itself, with the model of that axis."""
+    record = slanted_record()
+    mixed = lbt.identify(record, sensor_gain=1.0, most_lines=1)
+    model, (line,) = mixed.separated(), mixed.shared
+    joint = regression.regress(record, model, separate=True)
+    both = joint.solve(range(4), 1e-4, joint.whole)
+    shares, left_nm2 = [], joint.whole.targets
+    for i, axis in enumerate(model.axes):
+        (part,) = axis.parts
+        assert part.direction is None
+        assert part.rms_nm == pytest.approx(line.rms_nm * abs(line.direction[i]))
+        series = {name: getattr(record, name)[:, [i]] for name in ("measurements", "commands")}
+        facts = {"frame_rate_hz": record.frame_rate_hz, "delay_frames": 2, "unit": "nm"}
+        alone = regression.regress(loop_record(**series, **facts), replace(model, axes=(axis,)))
+        assert alone.whole.targets == pytest.approx(left_nm2[[i]])
+        expected = alone.solve(range(2), 1e-4, alone.whole)[:, 0]
+        assert both[joint.places([i, 2 + i]), i] == pytest.approx(expected, rel=1e-4, abs=1e-7)
+        assert not both[joint.places([1 - i, 3 - i]), i].any()
+        shares.append(alone.fit_share(1e-4))
+    assert joint.fit_share(1e-4) == pytest.approx(np.average(shares, weights=left_nm2))
+    couples = [regression.regress(record, mixed), joint]
+    for one, reads in zip(couples, (True, False), strict=True):
+        controller = one.design(1e-4).controller
+        response = controller.to_statespace().frequency_response([20.0])[0]
+        assert (np.abs(response[0, 1]) > 1e-3) == reads
+        assert (response[0, 1] != 0) == reads
 
 
 def test_more_noise_is_trusted_less() -> None:

@@ -13,6 +13,7 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 from support.exports import DifferenceEquation
 from support.lqg import slow_plant
+from support.recorded_loops import slanted_record
 from support.recorded_runs import recorded_run
 from support.refusals import refused, require_refusals
 
@@ -129,6 +130,49 @@ def test_what_the_matrix_cannot_hold_is_refused(tmp_path, config, designs):
     words = "residual at sensor gain 1, loss is .* Give a higher, even order"
     assert refused(write(lbt.kalman(lines), order=16), NumericalError, words).residual > 0.01
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("method", ["kalman", "predictor"])
+def test_a_record_of_mixing_axes_reaches_the_matrix_with_separate_axes(tmp_path, method):
+    """A line at 30 degrees; without the option the refusal names it, for scripts and terminals."""
+    made = partial(
+        lbt.design_from_record, slanted_record(), method=method, sensor_gain=1.0, most_lines=1
+    )
+    mixed, apart = made(), made(separate_axes=True)
+    words = r"must decouple.*design_from_record\(record, separate_axes=True\)"
+    write = partial(lbt.interop.export, tmp_path / "k.npy", target="dao")
+    error = refused(lambda: write(mixed.design), ProblemError, words)
+    assert "lbt-synth auto --separate-axes" in error.at_terminal
+    written = write(apart.design)
+    assert all(check.passed for check in written.checks)
+    # it costs what both axes tell of the line
+    *_, with_both = apart.held_out.entries
+    assert with_both.name == f"{apart.name}, axes mixed"
+    assert with_both.replayed_nm == mixed.held_out[mixed.name].replayed_nm
+    assert with_both.replayed_nm < apart.held_out[apart.name].replayed_nm
+
+
+@pytest.mark.parametrize("lines_hz", [(20,), range(70, 230, 18)])
+def test_a_matrix_has_the_order_and_the_factor_that_a_design_needs(tmp_path, lines_hz):
+    """One narrow line, and nine, which need more than order 20; plain coefficients lose 1 %."""
+    slow = -np.poly(0.9995 * np.exp([0.005j, -0.005j, -0.02])).real[1:]
+    air = lbt.models.ARModel(coefficients=slow, driving_rms_nm=0.02, frame_rate_hz=800)
+    lines = [lbt.Vibration(frequency_hz=f, damping=1e-3, rms_nm=300) for f in lines_hz]
+    design = lbt.kalman(slow_plant(modes=2, turbulence=air, vibrations=lines))
+    written = lbt.interop.export(tmp_path / "k.npy", design, "dao")
+    matrix = np.load(written.files[0]).astype(float)
+    M = len(matrix) // 2
+    assert json.loads(written.files[1].read_text())["order"] == M
+    assert (M > 20) == (len(lines_hz) > 1) == (f"is for M = {M} in the" in written.notes[0])
+    exact = dao.direct_form_rows(design.controller, M)
+    assert dao._loss(design, exact.astype(np.float32)) > 0.01
+    assert "have a factor more" in written.notes[0]
+    z = np.exp(0.5j)
+    ratios = []
+    for column in (matrix[:, 0], exact[:, 0]):
+        a = np.r_[1.0, -column[M + 1 :]]
+        ratios.append(np.polyval(column[: M + 1], z) / np.polyval(a, z))
+    assert ratios[0] == pytest.approx(ratios[1], rel=1e-4)  # the factor cancels
 
 
 @given(seed=st.integers(0, 2**32 - 1), orders=st.lists(st.integers(1, 5), min_size=1, max_size=3))

@@ -221,6 +221,10 @@ def test_wrong_parts_are_refused(plant):
         ({"turbulence": replace(AR1, frame_rate_hz=500)}, "must be sampled at the loop's 800 Hz"),
         ({"vibrations": [replace(line, direction=(1,))]}, "must have 2 components"),
         ({"vibrations": [replace(line, frequency_hz=450)]}, "below the Nyquist"),
+        ({"vibrations": line}, "vibrations must be a list; got Vibration"),
+        ({"vibrations": [1]}, "each vibration must be a Vibration; got int"),
+        ({"turbulence": None}, "turbulence must be an ARModel, .* got NoneType"),
+        ({"noise_nm": 1e-200}, "is singular. Every measurement needs noise"),
     ]
     require_refusals((partial(small_plant, **c), ProblemError, words) for c, words in rows)
     suite = SensorSuite(sensors=(replace(CHANNEL, rate_hz=RATE),))
