@@ -16,17 +16,20 @@ from lbt_synth.identification import LoopRecord
 from lbt_synth.interop.pipeline import Rehearsal, rehearse
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, simulate, strehl
-from lbt_synth.loop.budget import ResidualBudget
+from lbt_synth.loop.budget import ResidualBudget, residual_spectrum
 from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments, settling_frames
 from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
 from lbt_synth.storage.words import rank_names
 from lbt_synth.studies.grid import evaluate
 from lbt_synth.studies.limits import limits
 from lbt_synth.validation import FloatArray
+
+_SPECTRUM_STEP_HZ = 0.2  # at which MASTSEL 1.5 reads a spectrum for TIPTOP; P3 1.6 takes half of it
 
 
 class DesignRun(NamedTuple):
@@ -254,3 +257,14 @@ def say_references(truth: Truth, config: Config) -> list[str]:
     if config.hardware.suite.sensors:
         said += ", both by the loop's own sensor alone"
     return [f"{said}."]
+
+
+def tiptop_spectrum(loop: ClosedLoop, truth: Truth) -> bytes:
+    """Return the spectrum of a residual as TIPTOP's windPsdFile: rows of frequency, tip, tilt."""
+    if (modes := loop.hardware.modes) > 2:
+        raise ProblemError(f"--spectrum takes a loop of tip and tilt; got {modes} modes.")
+    frequency_hz, density = residual_spectrum(loop, truth, _SPECTRUM_STEP_HZ)
+    rows = np.zeros((3, frequency_hz.size + 1))  # from 0 Hz
+    rows[0, 1:], rows[1 : 1 + modes, 1:] = frequency_hz, density.T
+    cards = {"BUNIT": ("nm^2/Hz", "of rows 2 and 3: tip and tilt, one-sided")}
+    return fits_bytes(cards, {}, primary_data=rows)
