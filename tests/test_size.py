@@ -23,17 +23,17 @@ LINES = {
     "linear": 4766,
     "loop": 3983,
     "methods": 803,
-    "models": 3773,
+    "models": 3820,
     "report": 3531,
     "storage": 1164,
-    "studies": 3220,
+    "studies": 3171,
     "errors, validation": 565,
 }
 COUNTS = {
     "files of the package": 205,
     "public names": 147,
     "tuned constants": 504,
-    "lines of tests": 25126,
+    "lines of tests": 25127,
     "lines of benchmarks": 3998,
     "words of docs": 60140,
 }
