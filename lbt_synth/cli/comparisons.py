@@ -23,11 +23,12 @@ from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_title, referen
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures import studies as figures
+from lbt_synth.report.screen import say_limit, say_maps, say_residual
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text, unstable_text
-from lbt_synth.studies.limits import LimitStudy, limits, limits_at_rate, say_limit, say_residual
-from lbt_synth.studies.robustness import FAMILIES, compare_modes, compare_on_mirror, say_maps
+from lbt_synth.studies.limits import LimitStudy, limits, limits_at_rate
+from lbt_synth.studies.robustness import FAMILIES, compare_modes, compare_on_mirror
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _RATES = 34  # frame rates of a comparison, of which a table without --verbose has every third

@@ -23,9 +23,10 @@ from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.report.screen import say_limit, say_residual
 from lbt_synth.storage.display_unit import LENGTHS, nm_text, show_in, shown_unit
 from lbt_synth.storage.rows import Column, fact
-from lbt_synth.studies.limits import compare_in_truth, say_limit, say_residual
+from lbt_synth.studies.limits import compare_in_truth
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns

@@ -83,7 +83,7 @@ def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | Spec
     white = all(axis.whiteness.white for axis in model.axes)
     leaves = "is white: the model is enough" if white else "is not white: the model lacks something"
     said = "No vibration stands out of the turbulence and the noise."
-    if lines := model.parts:
+    if lines := [part for part in model.parts if part.kind != "turbulence"]:
         strongest = max(lines, key=lambda line: line.rms_nm)
         said = (
             f"{count_text(len(lines), 'vibration')}, the strongest of "

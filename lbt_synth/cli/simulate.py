@@ -19,17 +19,22 @@ from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
+from lbt_synth.loop import ClosedLoop
+from lbt_synth.loop.budget import residual_spectrum
 from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
+from lbt_synth.report.screen import say_references, say_runs
+from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.words import count_text, unstable_text
-from lbt_synth.studies.runs import DesignRun, run_design, say_references, say_runs, tiptop_spectrum
+from lbt_synth.studies.runs import DesignRun, run_design
 
 _TIME = r"(\d+\.?\d*)s?"
 _DROP = re.compile(rf"([^@]+)@{_TIME}(?:\.\.{_TIME})?(?::({'|'.join(READINGS)}))?")
+_SPECTRUM_STEP_HZ = 0.2  # at which MASTSEL 1.5 reads a spectrum for TIPTOP; P3 1.6 takes half of it
 _AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
 
 
@@ -98,6 +103,17 @@ def run_simulate(arguments: Namespace) -> Report:
     if arguments.spectrum is not None:
         report.note_written(write_atomically(arguments.spectrum, spectrum))
     return report
+
+
+def tiptop_spectrum(loop: ClosedLoop, truth: Truth) -> bytes:
+    """Return the spectrum of a residual as TIPTOP's windPsdFile: rows of frequency, tip, tilt."""
+    if (modes := loop.hardware.modes) > 2:
+        raise ProblemError(f"--spectrum takes a loop of tip and tilt; got {modes} modes.")
+    frequency_hz, density = residual_spectrum(loop, truth, _SPECTRUM_STEP_HZ)
+    rows = np.zeros((3, frequency_hz.size + 1))  # from 0 Hz
+    rows[0, 1:], rows[1 : 1 + modes, 1:] = frequency_hz, density.T
+    cards = {"BUNIT": ("nm^2/Hz", "of rows 2 and 3: tip and tilt, one-sided")}
+    return fits_bytes(cards, {}, primary_data=rows)
 
 
 def _run(

@@ -16,13 +16,12 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, print_error
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
-from lbt_synth.report.pages import replay_table, study_verdict
+from lbt_synth.report.pages import controller_table, replay_table, study_verdict
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.executors import choose_engine
 from lbt_synth.storage.words import duration_text, listing_text
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
 from lbt_synth.studies.study.statistics import (
-    controller_table,
     study_statistics,
     summary_tables,
     worst_table,

@@ -205,6 +205,21 @@ def study_verdict(statistics: StudyStatistics) -> list[str]:
     return verdict
 
 
+def controller_table(statistics: StudyStatistics) -> Table:
+    """Return a line for each controller."""
+    kinds = ("mean", "+-", "5th", "median", "95th", "unstable")
+    rows = []
+    for one in statistics.controllers:
+        low, median, high = (one.strehl[p].value for p in (5, 50, 95))
+        values = (one.mean, one.mean_error, low, median, high, one.unstable_share.value)
+        rows.append((one.controller, *(percent(value, 2) for value in values), str(one.failed)))
+    return Table(
+        caption="Strehl ratio over the samples, with percentiles; an unstable loop counts as 0",
+        headings=("controller", *(f"{kind} [%]" for kind in kinds), "failed"),
+        rows=tuple(rows),
+    )
+
+
 def replay_table(replay: Replay, row: int, names: Sequence[str]) -> Table:
     """List results of a row as stored and now, those in nm in the unit that is shown."""
     unit, factor = shown_unit("nm")

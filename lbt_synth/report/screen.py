@@ -1,12 +1,24 @@
-"""A table on a screen: what a verdict names is in it, and long names are shortened."""
+"""What a screen shows first: sentences that say the point, and one table with what they name."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from lbt_synth.config import Config
+from lbt_synth.design import integrator
+from lbt_synth.errors import LbtSynthError
+from lbt_synth.loop.least_residual import ResidualLimit
+from lbt_synth.models import Truth
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.tables import Table, least_width
+from lbt_synth.storage.words import rank_names, unstable_text
+from lbt_synth.studies.limits import limits
+from lbt_synth.studies.robustness import RobustnessMap
 
 _SHORTEST_NAME = 8  # letters that a name keeps which is shortened to make room
 
@@ -70,3 +82,66 @@ def _shortened(table: Table, letters: int) -> Table:
 
     rows = ((replace(row[0], text=said(row[0].text)), *row[1:]) for row in table.cells())
     return replace(table, headings=tuple(map(said, table.headings)), rows=tuple(rows))
+
+
+def say_residual(name: str, row: Facts, limit: ResidualLimit | None) -> str:
+    """Return the sentence on what a stable design leaves in the truth."""
+    said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
+    said += f"{100 * row.strehl:.1f} %)"
+    if limit is None or np.isnan(row.above_limit_percent):
+        return f"{said}."
+    least = nm_text(limit.rms_nm, ".1f")
+    return f"{said}, {row.above_limit_percent:z.0f} % above the {least} of the best linear one."
+
+
+def say_limit(limit: ResidualLimit, config: Config) -> str:
+    """Return the sentence on the limit of a truth."""
+    least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
+    own = " of the loop's own sensor" * bool(config.hardware.suite.sensors)
+    return f"least residual of any linear controller{own} in the truth: {least}"
+
+
+def say_maps(maps: Mapping[str, RobustnessMap], real: int, where: str) -> list[str]:
+    """Return where designs are unstable, and which keeps the highest Strehl ratio at worst."""
+    counts = {name: np.count_nonzero(~grid.stable) for name, grid in maps.items()}
+    unstable = sorted((name for name in maps if counts[name]), key=lambda name: -counts[name])
+    verdict = []
+    if unstable:
+        most = f"{'up to ' * (len(unstable) > 1)}{counts[unstable[0]]}"
+        pairs = f"{maps[unstable[0]].stable.size} pairs of a sensor gain and a delay error"
+        verdict = [f"{unstable_text(unstable)} at {most} of {pairs} of a map."]
+    lowest = {name: float(np.min(grid.strehl[:, real])) for name, grid in maps.items()}
+    best = max(lowest, key=lambda name: np.nan_to_num(lowest[name]))  # nan is unstable
+    if lowest[best] > 0:
+        percent = f"{100 * lowest[best]:.1f} %"
+        verdict.append(f"{best} keeps the highest Strehl ratio at worst over {where}, {percent}.")
+    return verdict
+
+
+def say_runs(rows: Sequence[Facts]) -> list[str]:
+    """Say what the designs of runs leave; of more than two the least and the most first."""
+    row_of, verdict = {row.design: row for row in rows}, []
+    residuals_nm = {name: float(row.residual_simulated_nm) for name, row in row_of.items()}
+    for name, word in rank_names(residuals_nm, " the least,", " the most,").items():
+        row = row_of[name]
+        said = f"{name} leaves{word} {nm_text(row.residual_simulated_nm, '.1f')} rms (Strehl ratio "
+        said += f"{100 * row.strehl_simulated:.1f} %)"
+        if row.residual_exact_nm is not None:
+            said += f", and {nm_text(row.residual_exact_nm, '.1f')} without chance"
+        verdict.append(f"{said}.")
+    return verdict
+
+
+def say_references(truth: Truth, config: Config) -> list[str]:
+    """Say what the best controllers of the loop's own sensor leave, if there are any."""
+    alone = config.hardware.own_sensor_alone()
+    try:
+        study = limits({"": integrator(alone, truth=truth)}, alone, truth, config.imaging)
+    except LbtSynthError:
+        return []
+    said = f"The best integrator leaves {nm_text(study.rows[0].residual_nm, '.1f')}"
+    if study.limit is not None:
+        said += f", the best linear controller {nm_text(study.limit.rms_nm, '.1f')}"
+    if config.hardware.suite.sensors:
+        said += ", both by the loop's own sensor alone"
+    return [f"{said}."]
