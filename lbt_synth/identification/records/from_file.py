@@ -125,11 +125,10 @@ def load_record(
     >>> seen.frame_rate_hz, seen.usable.tolist(), seen.measurements[0].round(2).tolist()
     (1000.0, [False, True, False], [29.89])
     """
-    if isinstance(source, Telemetry):
-        telemetry, name = source, str(source.metadata.get("name", "telemetry"))
-    else:
-        advice = "Take loop_record for series in memory."
-        telemetry, name = None, str(file_path(source, "a record", advice))
+    telemetry = source if isinstance(source, Telemetry) else None
+    if telemetry is None:
+        file_path(source, "a record, unless loop_record makes it of arrays,")
+    name = str(source if telemetry is None else telemetry.metadata.get("name", "telemetry"))
     stated: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,

@@ -228,7 +228,7 @@ def tip_tilt_plant(
     frame_rate_hz : float
         Frame rate [Hz].
     turbulence : ARModel or sequence of ARModel
-        Turbulence of each mode; one model serves all modes.
+        Turbulence of each mode, as :func:`ar1_turbulence` makes it; one model serves all modes.
     noise_nm : float, (q,) or (q, q) array_like
         Standard deviation of the measurement noise per frame, one for all measurements or one
         per measurement [nm], or its covariance [nm^2].
@@ -379,9 +379,7 @@ def spread_plant(plant: TipTiltPlant, *, half_width_hz: float, lines: int = 5) -
     >>> [line.frequency_hz for line in spread.vibrations]
     [19.25, 19.75, 20.25, 20.75]
     """
-    parts = require_instance(
-        plant, TipTiltPlant, "plant"
-    ).parts()  # refuses the memory of a mixed filter
+    parts = plant.parts()  # refuses the memory of a mixed filter
     if not plant.vibrations:
         raise ProblemError(
             "a frequency prior needs a plant with a vibration; got one without any. Try "
