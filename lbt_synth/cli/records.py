@@ -231,7 +231,7 @@ def run_diagnose(arguments: Namespace) -> Report:
         judge_channels,
         live_axes,
     )
-    from lbt_synth.report.pages import diagnosis_page, diagnosis_rows
+    from lbt_synth.report.pages import diagnosis_page, diagnosis_rows, say_diagnosis
 
     if arguments.output is not None:
         require_page_names(arguments.output, arguments.pdf, inputs=input_files(arguments))
@@ -264,7 +264,7 @@ def run_diagnose(arguments: Namespace) -> Report:
             "best": diagnosis.best or None,
             "notes": diagnosis.notes,
         },
-        verdict=list(diagnosis.verdict),
+        verdict=say_diagnosis(diagnosis, designs),
         notes=[marked_note(note) for note in diagnosis.notes],
     )
     for _, key, caption, rows in diagnosis_rows(diagnosis):

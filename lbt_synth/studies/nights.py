@@ -72,7 +72,7 @@ class NightsDesign:
         """What the design of one night alone costs at worst, and what that for all nights does."""
         alone = sorted(self.nights, key=self.worst)
         stable = [night for night in alone if self.worst(night)[0] < np.inf]
-        told = dict.fromkeys([n for n in alone if n not in stable] + stable[-1:] + stable[:1])
+        told = dict.fromkeys([n for n in alone if n not in stable][:2] + stable[-1:] + stable[:1])
         words = "; ".join(f"that of {night} {self._say(night)}" for night in told)
         first = f"The design of one night alone, on its worst night: {words}."
         if ALL not in self.residual_nm:

@@ -136,6 +136,13 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night):
     assert "tt.yaml would be replaced" in run(capsys, "auto", recorded_night, "-o", out)[2]
 
 
+def test_auto_separates_axes_and_says_what_that_costs(tmp_path, capsys, recorded_night):
+    words = ("--separate-axes", "--method", "kalman", "--no-figure", "-o", tmp_path / "k.fits")
+    *_, row = run_json(capsys, "auto", recorded_night, *words)["held_out"]
+    assert row["name"] == "Kalman filter, axes mixed"
+    assert row["data_nm"] > 0
+
+
 def test_an_open_loop_series_and_one_axis(tmp_path, capsys):
     total_nm = simulated_night()[0].total_nm[0][:, 0]
     noise = np.random.default_rng(0).standard_normal(len(total_nm))
