@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3217,
+    "cli": 3187,
     "config": 1629,
     "design": 6028,
     "files": 1263,
-    "identification": 8956,
-    "interop": 3732,
+    "identification": 9018,
+    "interop": 3734,
     "linear": 4766,
-    "loop": 3982,
+    "loop": 3983,
     "methods": 803,
-    "models": 3771,
+    "models": 3773,
     "report": 3351,
-    "storage": 1134,
-    "studies": 3200,
-    "errors, validation": 555,
+    "storage": 1135,
+    "studies": 3221,
+    "errors, validation": 565,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 502,
-    "lines of tests": 25007,
+    "lines of tests": 25057,
     "lines of benchmarks": 3998,
-    "words of docs": 60128,
+    "words of docs": 60099,
 }
 
 

@@ -318,7 +318,7 @@ def integrator_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> 
     >>> [round(lbt.design.integrator_gain_limit(path), 3) for path in paths]
     [1.0, 0.618, 0.445]
     """
-    single = hardware.single_mode()
+    single = require_instance(hardware, LoopHardware, "hardware").single_mode()
     taps = single.mirror_taps
     mean_delay_frames = 1 + float(np.abs(np.arange(taps.size) @ taps))
     gain = least = 0.5 / mean_delay_frames

@@ -254,3 +254,10 @@ def say_residual(name: str, row: Facts, limit: ResidualLimit | None) -> str:
         return f"{said}."
     least = nm_text(limit.rms_nm, ".1f")
     return f"{said}, {row.above_limit_percent:z.0f} % above the {least} of the best linear one."
+
+
+def say_limit(limit: ResidualLimit, config: Config) -> str:
+    """Return the sentence on the limit of a truth."""
+    least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
+    own = " of the loop's own sensor" * bool(config.hardware.suite.sensors)
+    return f"least residual of any linear controller{own} in the truth: {least}"

@@ -33,6 +33,7 @@ from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, choice
 
 ALL = "all nights"  # the design for all of them
@@ -71,7 +72,7 @@ class NightsDesign:
         """What the design of one night alone costs at worst, and what that for all nights does."""
         alone = sorted(self.nights, key=self.worst)
         stable = [night for night in alone if self.worst(night)[0] < np.inf]
-        told = dict.fromkeys([n for n in alone if n not in stable] + stable[-1:] + stable[:1])
+        told = dict.fromkeys([n for n in alone if n not in stable][:2] + stable[-1:] + stable[:1])
         words = "; ".join(f"that of {night} {self._say(night)}" for night in told)
         first = f"The design of one night alone, on its worst night: {words}."
         if ALL not in self.residual_nm:
@@ -162,6 +163,9 @@ def design_from_nights(
             raise
     designs = {night: recorded.design for night, recorded in made.items()}
     residual_nm = {night: _residuals_nm(design, made) for night, design in designs.items()}
+    for night, design in designs.items():
+        if np.isfinite([*residual_nm[night].values()]).all():
+            designs[night] = _assume_all_nights(night, design, made)
     notes = [
         f"{'warning: ' * note.startswith('warning: ')}{night}: {note.removeprefix('warning: ')}"
         for night, recorded in made.items()
@@ -198,6 +202,23 @@ def design_from_nights(
         alone, _ = best.verdict
         raise CertificateError(f"no design is stable on all nights. {alone} Leave a night out.")
     return best
+
+
+def _assume_all_nights(night: str, design: Design, nights: Mapping[str, RecordedDesign]) -> Design:
+    """Return the design of a night with the sensor gains of all nights, at which it is stable."""
+    gains = np.concatenate([recorded.gains for recorded in nights.values()])
+    if not np.ptp(gains):  # it is known
+        return design
+    intervals = (dict.fromkeys(f"{end:.3g}" for end in ends) for ends in gains)
+    texts = listing_text([*dict.fromkeys(map(" to ".join, intervals))])
+    return replace(
+        design,
+        assumptions=(
+            f"the sensor gain is one that a night allows: {texts}; the loop is stable at all of "
+            "these",
+            *(f"{night}: {assumption}" for assumption in design.assumptions),
+        ),
+    )
 
 
 def _residuals_nm(design: Design, nights: Mapping[str, RecordedDesign]) -> dict[str, float]:

@@ -37,6 +37,7 @@ from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.models.turbulence.ar_models import radial_orders
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
+from lbt_synth.storage.words import unstable_text
 from lbt_synth.studies.grid import ensemble_columns, evaluate, loop_columns
 from lbt_synth.studies.limits import LimitStudy, limits
 from lbt_synth.validation import (
@@ -516,3 +517,20 @@ def compare_modes(config: Config, modes: int) -> ModalStudy:
             "Kalman filters": modal_filters(air, **loop).rms_nm,
         },
     )
+
+
+def say_maps(maps: Mapping[str, RobustnessMap], real: int, where: str) -> list[str]:
+    """Return where designs are unstable, and which keeps the highest Strehl ratio at worst."""
+    counts = {name: np.count_nonzero(~grid.stable) for name, grid in maps.items()}
+    unstable = sorted((name for name in maps if counts[name]), key=lambda name: -counts[name])
+    verdict = []
+    if unstable:
+        most = f"{'up to ' * (len(unstable) > 1)}{counts[unstable[0]]}"
+        pairs = f"{maps[unstable[0]].stable.size} pairs of a sensor gain and a delay error"
+        verdict = [f"{unstable_text(unstable)} at {most} of {pairs} of a map."]
+    lowest = {name: float(np.min(grid.strehl[:, real])) for name, grid in maps.items()}
+    best = max(lowest, key=lambda name: np.nan_to_num(lowest[name]))  # nan is unstable
+    if lowest[best] > 0:
+        percent = f"{100 * lowest[best]:.1f} %"
+        verdict.append(f"{best} keeps the highest Strehl ratio at worst over {where}, {percent}.")
+    return verdict

@@ -10,20 +10,26 @@ from typing import NamedTuple
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
+from lbt_synth.design import Design, integrator
+from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification import LoopRecord
 from lbt_synth.interop.pipeline import Rehearsal, rehearse
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, simulate, strehl
-from lbt_synth.loop.budget import ResidualBudget
+from lbt_synth.loop.budget import ResidualBudget, residual_spectrum
 from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments, settling_frames
 from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.storage.array_file import fits_bytes
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
+from lbt_synth.storage.words import rank_names
 from lbt_synth.studies.grid import evaluate
+from lbt_synth.studies.limits import limits
 from lbt_synth.validation import FloatArray
+
+_SPECTRUM_STEP_HZ = 0.2  # at which MASTSEL 1.5 reads a spectrum for TIPTOP; P3 1.6 takes half of it
 
 
 class DesignRun(NamedTuple):
@@ -107,7 +113,9 @@ def _run_row(
     command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
     return facts(
         design=fact(name, "design"),
-        residual_simulated_nm=fact(float(np.sqrt(np.mean(rms_nm**2))), "residual", **NM),
+        residual_simulated_nm=fact(
+            float(np.sqrt(np.mean(rms_nm**2))), "residual", **NM, missing="unstable"
+        ),
         residual_exact_nm=fact(residual_nm, "exact", **NM),
         strehl_simulated=fact(float(np.mean(strehls)), "Strehl", **PERCENT),
         strehl_exact=fact(exact_ratio, "exact", **PERCENT),
@@ -220,3 +228,43 @@ def _assumed_gains(design: Design, record: LoopRecord) -> FloatArray:
             "record."
         )
     return record.known_gains(record.stated_gain) if record.stated_gain else gains
+
+
+def say_runs(rows: Sequence[Facts]) -> list[str]:
+    """Say what the designs of runs leave; of more than two the least and the most first."""
+    row_of, verdict = {row.design: row for row in rows}, []
+    residuals_nm = {name: float(row.residual_simulated_nm) for name, row in row_of.items()}
+    for name, word in rank_names(residuals_nm, " the least,", " the most,").items():
+        row = row_of[name]
+        said = f"{name} leaves{word} {nm_text(row.residual_simulated_nm, '.1f')} rms (Strehl ratio "
+        said += f"{100 * row.strehl_simulated:.1f} %)"
+        if row.residual_exact_nm is not None:
+            said += f", and {nm_text(row.residual_exact_nm, '.1f')} without chance"
+        verdict.append(f"{said}.")
+    return verdict
+
+
+def say_references(truth: Truth, config: Config) -> list[str]:
+    """Say what the best controllers of the loop's own sensor leave, if there are any."""
+    alone = config.hardware.own_sensor_alone()
+    try:
+        study = limits({"": integrator(alone, truth=truth)}, alone, truth, config.imaging)
+    except LbtSynthError:
+        return []
+    said = f"The best integrator leaves {nm_text(study.rows[0].residual_nm, '.1f')}"
+    if study.limit is not None:
+        said += f", the best linear controller {nm_text(study.limit.rms_nm, '.1f')}"
+    if config.hardware.suite.sensors:
+        said += ", both by the loop's own sensor alone"
+    return [f"{said}."]
+
+
+def tiptop_spectrum(loop: ClosedLoop, truth: Truth) -> bytes:
+    """Return the spectrum of a residual as TIPTOP's windPsdFile: rows of frequency, tip, tilt."""
+    if (modes := loop.hardware.modes) > 2:
+        raise ProblemError(f"--spectrum takes a loop of tip and tilt; got {modes} modes.")
+    frequency_hz, density = residual_spectrum(loop, truth, _SPECTRUM_STEP_HZ)
+    rows = np.zeros((3, frequency_hz.size + 1))  # from 0 Hz
+    rows[0, 1:], rows[1 : 1 + modes, 1:] = frequency_hz, density.T
+    cards = {"BUNIT": ("nm^2/Hz", "of rows 2 and 3: tip and tilt, one-sided")}
+    return fits_bytes(cards, {}, primary_data=rows)

@@ -13,8 +13,8 @@ from support.plants import LBT_YAML
 from support.refusals import refused
 
 import lbt_synth as lbt
-from lbt_synth.cli.simulate import tiptop_spectrum
 from lbt_synth.errors import ProblemError
+from lbt_synth.studies.runs import tiptop_spectrum
 
 
 def test_simulate(tmp_path, capsys, gains):

@@ -183,6 +183,7 @@ def test_refusals():
             (designed(truth=PATH), ProblemError, "truth must be a Truth; got LoopHardware"),
             (designed(0.1, truth=still), ProblemError, "a gain or a truth; got both"),
             (designed(0.1, path=3), ProblemError, "hardware must be a LoopHardware"),
+            (lambda: integrator_gain_limit(3), ProblemError, "hardware must be a LoopHardware"),
             (designed(truth=two), DimensionError, modes),
             (designed(truth=noisy), DimensionError, measurements),
             (lambda: lbt.loop.least_residual(PATH, two), DimensionError, modes),

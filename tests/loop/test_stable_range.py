@@ -232,6 +232,7 @@ def test_refusals():
         (lambda: moving_gain(lbt.close_loop(*strong)), unstable, "unstable"),
         (lambda: ratio(*strong), unstable, "unstable"),
         (several, lbt.errors.ProblemError, "several sensors"),
+        (lambda: lbt.loop.stable_sensor_gains(plant, 1), ValueError, "must be a LoopHardware"),
     ]
     require_refusals(rows)
 

@@ -169,7 +169,7 @@ def test_the_verdict_of_a_design_of_one_night(of_all, words) -> None:
     pair = {name: made.nights[name] for name in "ab"}
     made = replace(made, nights=pair, designs=designs, residual_nm=residual_nm)
     assert made.name == "b"
-    assert made.design is made.nights["b"].design
+    assert made.design.plant is made.nights["b"].design.plant
     first, second = made.verdict
     assert "that of a is unstable on b; that of b leaves 2.25 times" in first
     assert words in second
@@ -186,7 +186,8 @@ def test_a_design_for_all_that_is_worse_gives_way_to_that_of_a_night(monkeypatch
     made = design_from_nights(records)
     best = min("ab", key=made.worst)
     assert made.name == best
-    assert made.design is made.nights[best].design
+    assert made.design.plant is made.nights[best].design.plant
+    assert "a night allows: 0.7 and 0.6; the loop" in made.design.assumptions[0]
     assert f"worse on every night than that of {best} alone, which is written." in made.verdict[1]
 
 

@@ -37,6 +37,8 @@ _KINDS = (("measurements", "commands"), ("open_loop",), ("density", "frequency")
 CLOCKS = ("frame_numbers", "times")
 _ARRAY = re.compile(r".*\[(?=\d+\]$)")  # of which a name such as y[0] says that it is a column
 
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:e[-+]?\d+)?", re.IGNORECASE)
+
 Roles = dict[str, list[Column]]
 
 
@@ -234,7 +236,18 @@ def _read_text(out: Contents, content: bytes) -> None:
         if len(cells) != len(names):
             raise TelemetryError(f"line {n} must have {len(names)} cells; got {len(cells)}.")
     values = np.array([[_parse_number(cell) for cell in cells] for cells in table])
-    out.columns += [parse_column(name, of) for name, of in zip(names, values.T, strict=True)]
+    for i, (name, of) in enumerate(zip(names, values.T, strict=True)):
+        column = parse_column(name, of)
+        missing = [(row[i], n) for row, (n, _), x in zip(table, rows, of, strict=True) if x != x]
+        wrong = [(cell, n) for cell, n in missing if cell.lower() not in ("", "nan")]
+        is_series = column.role in OF_AXES and 2 * len(wrong) > len(table)
+        if wrong and (is_series or _DECIMAL_COMMA.fullmatch(wrong[0][0])):
+            raise TelemetryError(
+                f"{len(wrong)} cells of {join_names([column])} are no numbers, the first "
+                f"{wrong[0][0]!r} in line {wrong[0][1]}. Write them with decimal points, and what "
+                "is missing as nan."
+            )
+        out.columns.append(column)
 
 
 def _is_heading(cells: Sequence[str]) -> bool:

@@ -46,7 +46,7 @@ from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import read_cards
 from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, file_path
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
 _TELEMETRY_ARRAYS = {"META", "MEASURE"}
@@ -125,8 +125,11 @@ def load_record(
     >>> seen.frame_rate_hz, seen.usable.tolist(), seen.measurements[0].round(2).tolist()
     (1000.0, [False, True, False], [29.89])
     """
-    telemetry = source if isinstance(source, Telemetry) else None
-    name = str(source if telemetry is None else telemetry.metadata.get("name", "telemetry"))
+    if isinstance(source, Telemetry):
+        telemetry, name = source, str(source.metadata.get("name", "telemetry"))
+    else:
+        advice = "Take loop_record for series in memory."
+        telemetry, name = None, str(file_path(source, "a record", advice))
     stated: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,

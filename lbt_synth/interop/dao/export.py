@@ -13,7 +13,6 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -49,7 +48,6 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_cop
 ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
 _USUAL = 20  # M of the computers that we know; a design of a higher order needs that order
 _WIDEST = 20  # roots of a common factor: with more, its sums round by more than it saves
-_GAPS = np.pi / np.array([2, 2.5, 3])  # angles from z = 1 of the first roots; more ask for less
 _RADIUS = 0.92  # of the roots that are added, and largest square of one that the search moves
 _ROOM = 2e-3  # of each limit, for what lies between the nodes
 _SEARCHES = 19  # at most, each with other weights of the scenarios
@@ -243,12 +241,16 @@ def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float3
     return rounded
 
 
-def _widened(exact: FloatArray, width: int | None = None, gap: float = np.pi / 2) -> FloatArray:
-    """Multiply both polynomials by a factor, up to the order, with roots at a gap from z = 1."""
+def _widened(exact: FloatArray, width: int | None = None) -> FloatArray:
+    """Multiply both polynomials by a factor with roots away from z = 1, at most up to the order.
+
+    With a width, they are at roots of unity, whose places next to z = 1 the poles take.
+    """
     M = exact.size // 2
     b, a = np.trim_zeros(exact[: M + 1], "b"), np.r_[1.0, -np.trim_zeros(exact[M + 1 :], "b")]
-    spare = M + 1 - max(b.size, a.size)
-    spare = spare if width is None else min(width, spare)
+    longer = max(b.size, a.size)
+    spare = M + 1 - longer if width is None else min(width, M + 1 - longer)
+    gap = np.pi / 2 if width is None else np.pi * longer / (longer - 1 + spare)
     angles = np.linspace(gap, np.pi, spare // 2, endpoint=False)
     roots = _RADIUS * np.concatenate(
         [np.exp(1j * angles), np.exp(-1j * angles), [-1] * (spare % 2)]
@@ -497,11 +499,11 @@ def _columns(design: Design, exact: FloatArray) -> tuple[float, _Matrix]:
             columns = make_again(design, exact)
             return _loss(design, columns), columns
         spare = min(_WIDEST, len(exact) // 2 - np.min(np.count_nonzero(exact, axis=0)) // 2)
-        for factor in product(range(2, spare + 1, 2), _GAPS) if best[0] >= LOSS else ():
-            wide = np.stack([_widened(column, *factor) for column in exact.T], axis=1)
+        for width in range(2, spare + 1) if best[0] >= LOSS else ():
+            wide = np.stack([_widened(column, width) for column in exact.T], axis=1)
             columns = wide.astype(np.float32)
             best = min(best, (_loss(design, columns), columns), key=itemgetter(0))
-            if best[0] < LOSS / 4:
+            if best[0] < LOSS / 10:
                 break
     return best
 

@@ -379,7 +379,9 @@ def spread_plant(plant: TipTiltPlant, *, half_width_hz: float, lines: int = 5) -
     >>> [line.frequency_hz for line in spread.vibrations]
     [19.25, 19.75, 20.25, 20.75]
     """
-    parts = plant.parts()  # refuses the memory of a mixed filter
+    parts = require_instance(
+        plant, TipTiltPlant, "plant"
+    ).parts()  # refuses the memory of a mixed filter
     if not plant.vibrations:
         raise ProblemError(
             "a frequency prior needs a plant with a vibration; got one without any. Try "

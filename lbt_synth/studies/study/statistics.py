@@ -212,6 +212,21 @@ def first_order_index(parameter: FloatArray, result: FloatArray) -> tuple[float,
     return 1 - unexplained - correction, max(float(np.std(influence)) / n**0.5, least)
 
 
+def controller_table(statistics: StudyStatistics) -> Table:
+    """Return a line for each controller."""
+    kinds = ("mean", "+-", "5th", "median", "95th", "unstable")
+    rows = []
+    for one in statistics.controllers:
+        low, median, high = (one.strehl[p].value for p in (5, 50, 95))
+        values = (one.mean, one.mean_error, low, median, high, one.unstable_share.value)
+        rows.append((one.controller, *(percent(value, 2) for value in values), str(one.failed)))
+    return Table(
+        caption="Strehl ratio over the samples, with percentiles; an unstable loop counts as 0",
+        headings=("controller", *(f"{kind} [%]" for kind in kinds), "failed"),
+        rows=tuple(rows),
+    )
+
+
 def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
     """Return the tables of a study that have rows: Strehl ratios, residuals, dependence."""
     kinds = (strehl_table, residual_table, sensitivity_table)

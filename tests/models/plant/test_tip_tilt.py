@@ -232,6 +232,7 @@ def test_wrong_parts_are_refused(plant):
     spread, fast = lbt.models.spread_plant, retuned_plant(plant, 379.0)
     seen, gain = example_plant(), np.zeros((1, 2, 3))
     rows = [
+        (lambda: spread(suite, half_width_hz=1), ProblemError, "plant must be a TipTiltPlant"),
         (lambda: spread(small_plant(), half_width_hz=1), ProblemError, "needs a plant with a vibr"),
         (lambda: spread(plant, half_width_hz=20), ProblemError, "must be below 20; got 20. All"),
         (lambda: spread(plant, half_width_hz=1, lines=65), ProblemError, "must be at most 64"),
