@@ -15,27 +15,27 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3204,
-    "config": 1629,
-    "design": 6035,
+    "config": 1620,
+    "design": 6034,
     "files": 1273,
-    "identification": 9018,
-    "interop": 3734,
-    "linear": 4766,
-    "loop": 3983,
-    "methods": 803,
-    "models": 3820,
+    "identification": 8969,
+    "interop": 3694,
+    "linear": 4760,
+    "loop": 3979,
+    "methods": 802,
+    "models": 3810,
     "report": 3531,
     "storage": 1164,
     "studies": 3171,
-    "errors, validation": 565,
+    "errors, validation": 564,
 }
 COUNTS = {
     "files of the package": 205,
     "public names": 147,
     "tuned constants": 504,
-    "lines of tests": 25127,
+    "lines of tests": 25012,
     "lines of benchmarks": 3998,
-    "words of docs": 60140,
+    "words of docs": 60166,
 }
 
 
