@@ -18,7 +18,7 @@ LINES = {
     "config": 1620,
     "design": 6034,
     "files": 1273,
-    "identification": 8969,
+    "identification": 8941,
     "interop": 3694,
     "linear": 4760,
     "loop": 3979,
