@@ -162,22 +162,15 @@ def test_what_makes_no_sense_is_refused():
     require_refusals((call, ProblemError, words) for call, words in rows)
 
 
-@pytest.fixture(scope="module")
-def example(tmp_path_factory):
-    """The example with 40 functions in place of 60: the design takes half as long."""
-    path = tmp_path_factory.mktemp("robust") / "fewer.yaml"
+def test_the_example_holds_at_every_row_and_sensor_gain(tmp_path):
+    """It has 40 functions in place of 60: the design takes half as long."""
+    path = tmp_path / "fewer.yaml"
     path.write_text(EXAMPLE.read_text().replace("    loss:", "    functions: 40\n    loss:"))
-    return lbt.load_config(path).design("robust")
-
-
-def test_the_example_holds_at_every_row_and_sensor_gain(example):
-    config = lbt.load_config(EXAMPLE)
+    config = lbt.load_config(path)
+    example = config.design("robust")
     camera = replace(config.imaging, other_modes=0.841)
     noise = replace(config.truth, noise_nm=15.5)
-    grid = {"errors_hz": np.arange(-7, 8) / 2, "sensor_gains": [1, 0.7, 0.5, 0.358]}
-    rows = lbt.studies.robustness_map(example, noise, camera, **grid)
-    worst = 100 * np.min(rows.strehl[0], axis=1)
-    (line,), (errors_hz, gains) = noise.vibrations, grid.values()
+    (line,), errors_hz, gains = noise.vibrations, np.arange(-7, 8) / 2, [1, 0.7, 0.5, 0.358]
     frequency_hz = np.tile(line.frequency_hz + errors_hz, len(gains))
     facts = {"rms_nm": line.rms_nm, "direction": line.direction}
     moved = EnsembleVibration(frequency_hz=frequency_hz, **facts)
@@ -189,34 +182,8 @@ def test_the_example_holds_at_every_row_and_sensor_gain(example):
         residuals = lbt.strehl(ensemble_residuals(*loops, frame_means=frame_means), camera)
         return 100 * np.min(residuals.reshape(len(gains), -1), axis=1)
 
-    means = worst_strehl(True)
+    means, worst = worst_strehl(True), worst_strehl(False)
     assert np.all(means >= [83, 82.5, 82, 80.5])
     assert np.all(means <= 84.1)
-    np.testing.assert_allclose(worst, worst_strehl(False), atol=1e-4)
     # what moves within frames dims the image by 1 % at most
     assert np.all((means - 1.5 < worst) & (worst < means))
-
-
-def test_the_example_is_stable_over_its_interval_with_its_margin_and_few_states(example):
-    hardware = example.hardware
-    low, high = lbt.loop.stable_sensor_gains(hardware, example.controller)
-    assert low < 0.25 < 1.3 < high
-    assert lbt.loop_margins(lbt.close_loop(hardware, example.controller)).modulus >= 0.45
-    assert example.states_per_mode <= 20
-    assert example.controller.n_states == 2 * example.states_per_mode
-    assert 0 < example.loss <= 0.25
-
-
-def test_a_fraction_of_the_delay_costs_what_lies_between_whole_ones(config):
-    """Commands that alternated cost 4 nm in the image at 2.49 frames, and the delay margin."""
-    facts = {"bands": [VibrationBand(low_hz=18, high_hz=22, rms_nm=797)], "functions": 30}
-    facts |= {"turbulence": config.truth.turbulence, "states": None}
-    residuals = []
-    for delay in (2, 2.49, 3):
-        path = replace(config.hardware, delay_frames=delay)
-        design = lbt.robust(replace(config.plant, hardware=path), **facts)
-        loop = lbt.close_loop(path, design.controller)
-        residuals.append(lbt.residual_budget(loop, config.truth).rms_nm)
-        assert lbt.loop_margins(loop).delay_frames > 1
-    assert residuals == sorted(residuals)
-    assert residuals[-1] < 1.05 * residuals[0]

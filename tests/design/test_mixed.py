@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 from support.plants import lbt_axis_plant, random_problem
 from support.refusals import require_refusals
 
@@ -47,30 +46,6 @@ def test_more_taps_never_do_worse_and_converge(ends):
     rms = np.array([lbt.mixed(plant, gamma=bound, taps=taps).rms for taps in (1, 4, 12, 16)])
     assert np.all(rms[1:] <= rms[:-1] * (1 + 1e-7))
     assert rms[2] / rms[3] - 1 < 2e-4
-
-
-def test_no_gain_of_the_plants_own_order_does_better(ends):
-    """An independent search over all predictor gains, not convex, ends above."""
-    plant, least, _ = ends
-    bound = 1.05 * least.gamma_least
-    start = central_filter(plant, gamma=bound).gain_predictor
-
-    def judged(x, measure, otherwise):
-        system = plant.error_system(start * x[:, None])
-        return measure(system) if system.spectral_radius < 1 else otherwise
-
-    def variance(x):
-        return judged(x, lambda system: np.trace(system.output_covariances()[0]) / 1e4, 1e8)
-
-    def room(x):
-        return judged(x, lambda system: (bound - float(lbt.hinf_norm(system))) / 100, -10.0)
-
-    one, above = np.ones(len(start)), {"type": "ineq", "fun": room}
-    options = {"maxiter": 40, "ftol": 1e-6, "eps": 1e-6}
-    search = minimize(variance, one, method="SLSQP", constraints=[above], options=options)
-    assert 100 * room(search.x) > -1e-5 * bound
-    assert variance(search.x) < 0.98 * variance(one)  # the search did something
-    assert lbt.mixed(plant, gamma=bound).rms < 100 * np.sqrt(variance(search.x))
 
 
 @settings(max_examples=2)

@@ -111,17 +111,6 @@ def test_inputs_that_are_not_finite_leave_the_state():
     assert not plain.state.any()
 
 
-def test_a_mirror_that_stops_short_winds_up_the_plain_form_alone():
-    config, design = lbt_config(), DESIGNS["kalman"]()
-    facts = {"frames": 1200, "seed": 3, "settle_frames": 0, "stroke": 1200.0}
-    plain, given = (
-        lbt.simulate(form, config.truth, hardware=config.hardware, **facts)
-        for form in (design.controller, estimator_form(design))
-    )
-    assert np.max(np.abs(plain.commands)) == np.max(np.abs(given.commands)) == 1200
-    assert plain.rms_nm[0] > 2 * given.rms_nm[0]
-
-
 QUIET, LONGEST = 200, 400  # frames before an episode, and of one at most
 TURBULENCE_NM, POLE, LINE_NM, LINE_HZ, NOISE_NM = 592.0, 0.9886, 797.0, 20.0, 15.5
 

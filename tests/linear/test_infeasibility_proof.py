@@ -14,21 +14,6 @@ from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 
 
-def test_the_witness_is_a_signal_that_no_measurement_shows(axis_plant):
-    """Play the burst: y stays zero, and z has gamma times the energy of w."""
-    p = axis_plant
-    design = lbt.hinf(p, route="riccati")
-    x, w = design.witness.states, design.witness.disturbances
-    size = sum(np.linalg.norm(a, 2) * np.linalg.norm(b, 2) for a, b in ((p.C, x), (p.D, w)))
-    assert np.linalg.norm(p.C @ x + p.D @ w) < 1e-9 * size
-    after = p.A @ x + p.B @ w
-    scale = np.sqrt(np.diag(after @ after.T))
-    growth = (after @ after.T - x @ x.T) / np.outer(scale, scale)
-    assert np.linalg.eigvalsh(growth)[0] > -1e-9
-    ratio = np.linalg.norm(p.L @ after) / np.linalg.norm(w)
-    assert ratio == pytest.approx(design.gamma_infeasible, rel=1e-6)
-
-
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 4), r=st.integers(1, 5))
 def test_no_witness_proves_too_much(seed, n, r):

@@ -60,11 +60,8 @@ def test_states_of_very_different_sizes_are_balanced_without_a_warning():
 PATH = lbt.LoopHardware(frame_rate_hz=100, delay_frames=2, modes=2)
 
 
-def random_stack(seed=0, *, period=5, n=3, m=2, p=2, kind=StateSpace):
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((period, n, n))
-    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
-    B, C, D = (rng.standard_normal((period, *size)) for size in ((n, m), (p, n), (p, m)))
+def random_stack(*, period=5, m=2, kind=StateSpace):
+    A, B, C, D = random_system(0, 3, m, 2, 0.9, period)
     return kind(A=A, B=B, C=C, D=D, dt_s=0.01)
 
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
-from support.uneven_axes import LOOPS, QUICK, SLOW, TABLE
 
 import lbt_synth as lbt
 from lbt_synth.loop.disturbances import draw_disturbance, draw_others, draw_phase
@@ -13,6 +12,9 @@ from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=800)
+QUICK = lbt.models.ARModel(coefficients=[1.6, -0.65], driving_rms_nm=25.0, frame_rate_hz=800)
+TABLE = lbt.models.TabulatedSpectrum(frequency_hz=[1, 20, 120], density_nm2_hz=[900, 400, 3])
 
 
 def test_drawn_series_have_their_spectrum(air):
@@ -40,7 +42,7 @@ def test_power_is_drawn_whole_however_short_the_series(air):
 
 
 def test_every_controller_and_mode_meets_the_weather_of_its_seed():
-    both, _ = LOOPS
+    both = lbt.LoopHardware(frame_rate_hz=800)
 
     def run(other, gain=0.4, seed=1):
         law, truth = lbt.integrator(both, gain=gain), lbt.Truth(turbulence=[SLOW, other])

@@ -76,17 +76,13 @@ def one_pole(pole, gain=0.5, *, delay_frames=1):
     return path, lbt.Controller(A=pole, B=gain, C=1.0, D=0.0, dt_s=1 / 800)
 
 
-def integrator_loop(delay_frames, gain=0.5):
-    return lbt.close_loop(*one_pole(1.0, gain, delay_frames=delay_frames))
-
-
 @pytest.mark.parametrize("low", [1e-3, 3.0])
 def test_one_state_is_proved_exactly_where_each_constant_gain_is_stable(low):
     """``|1 - g / 2| < 1`` at both ends is necessary and sufficient: gains up to 4."""
-    loop = integrator_loop(1)
+    loop, late = (lbt.close_loop(*one_pole(1.0, delay_frames=delay)) for delay in (1, 2))
     assert circle_norm(loop, low=low, high=4 - 1e-5) < ranges.CIRCLE_LIMIT
     assert circle_norm(loop, low=low, high=4 + 1e-5) > 1
-    assert circle_norm(integrator_loop(2), low=0.5, high=4.5) == np.inf
+    assert circle_norm(late, low=0.5, high=4.5) == np.inf
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.1, 1.5), (0.8, 0.9), (0.8, 1.35)])
@@ -96,7 +92,8 @@ def test_an_integrator_of_two_frames_against_its_closed_form(low, high):
     cosine = min((1 + a) / (4 * a), 1.0)
     least = 4 * a * cosine**2 - 2 * (1 + a) * cosine + 1 + (1 - a) ** 2
     expected = r * a / np.sqrt(least)
-    assert circle_norm(integrator_loop(2), low=low, high=high) == pytest.approx(expected, rel=1e-9)
+    loop = lbt.close_loop(*one_pole(1.0, delay_frames=2))
+    assert circle_norm(loop, low=low, high=high) == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one():

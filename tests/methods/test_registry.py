@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 from support.commands import refuse_commands, run_done, run_json
-from support.plants import LBT_YAML, ROOT
+from support.plants import ROOT
 from support.refusals import require_refusals
 
 from lbt_synth.design import Check, Design
@@ -105,30 +105,6 @@ def test_commands_take_a_method_of_the_table(leaky, small_config, tmp_path, caps
     assert (shown["leak_per_s"], shown["gain"]) == (5.0, 0.3)
     assert shown["matrices"]["A"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))
     run_done(capsys, "verify", gain)
-
-
-STUDY = """\
-version: 1
-config: {config}
-samples: 4
-controllers:
-  forgetful: {{design: leaky, leak_per_s: 5.0}}
-  own: {{design: leaky, leak_per_s: {leak}, for: sample}}
-parameters:
-  truth.vibrations[0].frequency_hz: {{uniform: [18.0, 22.0]}}
-"""
-
-
-def test_a_study_takes_a_method_of_the_table(leaky, tmp_path, capsys):
-    study, out = tmp_path / "study.yaml", tmp_path / "out"
-    study.write_text(STUDY.format(config=LBT_YAML, leak=5.0))
-    run_done(capsys, "study", study, "-o", out)
-    rows = np.genfromtxt(out / "results.csv", delimiter=",", names=True)
-    assert np.all(rows["forgetfulstable"] == 1)
-    np.testing.assert_allclose(rows["forgetfulstrehl"], rows["ownstrehl"], rtol=1e-9)
-    study.write_text(STUDY.format(config=LBT_YAML, leak=-1.0))
-    rows = [("study FILE -o OTHER", "controllers.own: leak_per_s must be above 0; got -1.")]
-    refuse_commands(capsys, rows, FILE=study, OTHER=tmp_path / "out2")
 
 
 def test_no_other_file_names_a_method():

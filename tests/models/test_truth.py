@@ -96,14 +96,6 @@ def test_the_sinusoid_has_the_frequency_at_each_time():
     assert np.max(np.abs(series)) == pytest.approx(100 * np.sqrt(2), rel=1e-3)
 
 
-def test_without_a_drift_it_is_the_sinusoid():
-    series = drawn(drifting(frequency_hz=20, end_hz=20), 4000, 321)
-    wave = np.exp(2j * np.pi * np.arange(4000) / 40)
-    phasor = 2 * np.mean(series * wave.conj())  # over whole turns
-    np.testing.assert_allclose(series, np.real(phasor * wave), atol=1e-8)
-    assert np.std(series) == pytest.approx(100, rel=1e-3)
-
-
 def test_a_direction_is_scaled_once():
     """Else a gain file would move the lines that it holds by a last digit."""
     for vector in np.random.default_rng(0).standard_normal((10, 3)):

@@ -35,18 +35,6 @@ def sampled(system, dt_s=1.0):
     return control.sample_system(control.ss(system), dt_s, method="bilinear")
 
 
-def sampled_plant(seed, *, n):
-    """A random plant of some states in continuous time, without D11, sampled."""
-    drawn = random_plant(seed, n=n)
-    plant = replace(drawn, D11=0 * drawn.D11)
-    rng = np.random.default_rng(seed + 10**5)
-    A = rng.normal(size=(n, n)) - rng.uniform(0, 2) * np.eye(n)
-    whole = replace(plant.whole, A=A)
-    _, controls, _, measurements = plant.sizes
-    continuous = sampled(control.ss(whole.A, whole.B, whole.C, whole.D))
-    return lbt.linear.GeneralizedPlant.of(continuous, measurements=measurements, controls=controls)
-
-
 def lightly_damped_plant(seed):
     """A plant of 2 to 8 states whose modes decay by 1e-8 to 1e-2 per sample, of many sizes."""
     rng = np.random.default_rng(seed + 10**6)

@@ -43,20 +43,25 @@ def path_of(**options):
     return lbt.LoopHardware(**({"frame_rate_hz": RATE} | options))
 
 
+def integrator_residual(gain, path, truth):
+    """Return what an integrator of one mode leaves in the image, nan if it is unstable."""
+    law = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=path.dt_s)
+    loop = lbt.close_loop(path, law, sensor_gain=truth.sensor_gain)
+    return lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else np.nan
+
+
 def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None, sensor_gain=1.0):
     """Return what an integrator for each mode leaves in the image, (n,), nan if unstable."""
     path, residuals = (hardware or path_of()).single_mode(), []
     conditions = (np.broadcast_to(values, len(gains)) for values in (noise_nm, sensor_gain))
     for mode, (gain, noise, sensor) in enumerate(zip(gains, *conditions, strict=True)):
-        law = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=path.dt_s)
         lines = [
             replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz * path.dt_s))
             for line in np.atleast_1d((vibrations or {}).get(mode, []))
         ]
         facts = {"vibrations": lines, "noise_nm": float(noise), "sensor_gain": float(sensor)}
-        loop = lbt.close_loop(path, law, sensor_gain=float(sensor))
         truth = lbt.Truth(turbulence=air.take(mode), **facts)
-        residuals.append(lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else np.nan)
+        residuals.append(integrator_residual(gain, path, truth))
     return np.array(residuals)
 
 

@@ -1,6 +1,5 @@
 """Plants and problems that many tests share."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +31,3 @@ def random_problem(rng, n, q=1, l=1):
     D = rng.standard_normal((q, p))
     B, C, L = (rng.standard_normal(shape) for shape in ((n, p), (q, n), (l, n)))
     return lbt.EstimationProblem(A=A, B=B, C=C, D=D, L=L)
-
-
-def with_own_noise(problem):
-    """The same problem with its measurement noise on columns of its own."""
-    q, p = problem.D.shape
-    B = np.hstack([problem.B, np.zeros((len(problem.B), q))])
-    return replace(problem, B=B, D=np.hstack([np.zeros((q, p)), problem.D[:, :q] + 2 * np.eye(q)]))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
-from support.generalized_plants import lightly_damped_plant, random_plant, sampled_plant, stacked
+from support.generalized_plants import lightly_damped_plant, random_plant, stacked
 from support.plants import ROOT
 
 import lbt_synth as lbt
@@ -64,8 +64,12 @@ def test_what_is_pushed_and_not_measured_is_left_and_what_is_controlled_is_not()
     unseen = GeneralizedPlant(**one, **direct, B1=[[0.0, 1.0]], C1=0.0, C2=1.0)
     assert lbt.hinf_controller(unseen).gamma_least == pytest.approx(2.0, rel=1e-8)
     seen = GeneralizedPlant(**one, B1=np.ones((1, 3)), C1=1.0, C2=np.zeros((3, 1)), D21=np.eye(3))
-    for plant in (seen, sampled_plant(8, n=3), sampled_plant(23, n=3)):
-        assert lbt.hinf_controller(plant).gamma_least < 1e-9
+    assert lbt.hinf_controller(seen).gamma_least < 1e-9
+    for seed, n in ((8, 3), (23, 2)):  # all zeros are at 0.5
+        drawn, zeros = random_plant(seed, n=n), 0.5 * np.eye(n)
+        A = zeros + drawn.B2 @ np.linalg.solve(drawn.D12, drawn.C1)
+        C2 = drawn.D21 @ np.linalg.solve(drawn.B1, A - zeros)
+        assert lbt.hinf_controller(replace(drawn, A=A, C2=C2)).gamma_least < 1e-9
 
 
 def test_perfect_control_of_lightly_damped_modes_is_certified():

@@ -9,6 +9,7 @@ import scipy.linalg
 import slycot
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.periodic_problems import relative_distance
 from support.plants import lbt_axis_plant
 from support.refusals import refused, require_refusals
 
@@ -16,11 +17,6 @@ import lbt_synth as lbt
 from lbt_synth.errors import DetectabilityError, NumericalError, ProblemError
 from lbt_synth.linear import GeneralizedPlant
 from lbt_synth.linear.riccati import dare
-
-
-def residual(A, B, Q, R, S, X):
-    gain = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
-    return A.T @ X @ A - X + Q - (A.T @ X @ B + S) @ gain
 
 
 @given(a=st.floats(-3, 3), q=st.floats(1e-6, 1e6), r=st.floats(1e-6, 1e6))
@@ -32,19 +28,25 @@ def test_scalar_closed_form(a, q, r):
     assert lbt.solve_dare(a, 1, q, r).X[0, 0] == pytest.approx(exact, rel=1e-9)
 
 
+def random_stack(seed, count, n, m):
+    rng = np.random.default_rng(seed)
+    W = rng.standard_normal((count, n + m, n + m))
+    W = W @ np.swapaxes(W, -1, -2) + 1e-3 * np.eye(n + m)
+    A, B = rng.standard_normal((count, n, n)), rng.standard_normal((count, n, m))
+    return A, B, W[:, :n, :n], W[:, n:, n:], W[:, :n, n:]
+
+
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 8), m=st.integers(1, 3))
 def test_random_equations_against_scipy(seed, n, m):
-    rng = np.random.default_rng(seed)
-    A, B = rng.standard_normal((n, n)), rng.standard_normal((n, m))
-    W = rng.standard_normal((n + m, n + m))
-    W = W @ W.T + 1e-3 * np.eye(n + m)
-    Q, S, R = W[:n, :n], W[:n, n:], W[n:, n:]
+    A, B, Q, R, S = (matrices[0] for matrices in random_stack(seed, 1, n, m))
     solution = lbt.solve_dare(A, B, Q, R, S)
-    expected = scipy.linalg.solve_discrete_are(A, B, Q, R, s=S)
-    assert np.allclose(solution.X, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    X, expected = solution.X, scipy.linalg.solve_discrete_are(A, B, Q, R, s=S)
+    assert np.allclose(X, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
     assert np.max(np.abs(solution.poles)) < 1
-    scale = np.linalg.norm(solution.X, 1) * (1 + np.linalg.norm(A, 1) ** 2)
-    assert np.linalg.norm(residual(A, B, Q, R, S, solution.X), 1) / scale < 1e-10
+    gain = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
+    residual = A.T @ X @ A - X + Q - (A.T @ X @ B + S) @ gain
+    scale = np.linalg.norm(X, 1) * (1 + np.linalg.norm(A, 1) ** 2)
+    assert np.linalg.norm(residual, 1) / scale < 1e-10
 
 
 EYE, TWO = np.eye(2), np.ones((2, 1))
@@ -82,14 +84,6 @@ def test_equations_without_a_solution_are_refused():
     ]
     rows += [(partial(solve, *parts), ProblemError, words) for *parts, words in WRONG]
     require_refusals(rows)
-
-
-def random_stack(seed, count, n, m):
-    rng = np.random.default_rng(seed)
-    W = rng.standard_normal((count, n + m, n + m))
-    W = W @ np.swapaxes(W, -1, -2) + 1e-2 * np.eye(n + m)
-    A, B = rng.standard_normal((count, n, n)), rng.standard_normal((count, n, m))
-    return A, B, W[:, :n, :n], W[:, n:, n:], W[:, :n, n:]
 
 
 def test_leading_dimensions_are_broadcast():
@@ -185,7 +179,7 @@ def test_the_estimated_error_is_of_the_size_of_the_error():
     *problem, X = EXAMPLES["2.5 tau=1e+08"]
     solution = lbt.solve_dare(*problem)
     assert 1e-15 < solution.error < 1e-10
-    assert relative(solution.X, X) < 100 * solution.error
+    assert relative_distance(solution.X, X) < 100 * solution.error
     assert lbt.solve_dare(1, 1, 1, 1).error < 1e-15
 
 
@@ -240,10 +234,6 @@ EXAMPLES = {
 }
 
 
-def relative(X, exact):
-    return np.linalg.norm(X - exact) / np.linalg.norm(exact)
-
-
 def peers(A, B, Q, R):
     """Answers of scipy and SLICOT, those that they give."""
     A, B, Q, R = (np.atleast_2d(part).astype(float) for part in (A, B, Q, R))
@@ -259,8 +249,9 @@ def test_known_solutions(name):
     """Never worse than ten times the better of the peers, nor than rounding."""
     *problem, exact = EXAMPLES[name]
     solution = lbt.solve_dare(*problem)
-    error = relative(solution.X, exact)
-    assert error <= 10 * max(min(relative(X, exact) for X in peers(*problem)), np.finfo(float).eps)
+    error = relative_distance(solution.X, exact)
+    least = min(relative_distance(X, exact) for X in peers(*problem))
+    assert error <= 10 * max(least, np.finfo(float).eps)
     assert error < 1e-12
     assert np.max(np.abs(solution.poles)) < 1
 
