@@ -124,10 +124,7 @@ def _moments(side: GeneralizedPlant, root: FloatArray, pairs: Witness) -> _Momen
 def _hide(
     side: GeneralizedPlant, states: FloatArray, signals: FloatArray
 ) -> tuple[FloatArray, _Moments | None]:
-    """Change signals as little as hides them from what the constraint reads.
-
-    Return the successors (n, r), and the moments without growth; None where they are not hidden.
-    """
+    """Hide signals by the least change; return successors (n, r), and moments if it hides them."""
     shown = side.B2.T @ states + side.D12.T @ signals
     signals = signals - np.linalg.pinv(side.D12.T, rcond=1e-10) @ shown
     seen, cancelled = side.B2.T @ states, side.D12.T @ signals

@@ -468,9 +468,11 @@ def regularise(plant: GeneralizedPlant, share: float) -> GeneralizedPlant:
     """
     P, n = plant, len(plant.A)
     m1, m2, p1, p2 = P.sizes
-    K = _cancelling(P)
-    error = share * _size(P.C1 + P.D12 @ K @ P.C2, P.D12, P.D11 + P.D12 @ K @ P.D21)
-    push = share * _size(P.B1 + P.B2 @ K @ P.D21, P.D21, P.D11 + P.D12 @ K @ P.D21)
+    K = -np.linalg.pinv(P.D12, rcond=_PART) @ P.D11 @ np.linalg.pinv(P.D21, rcond=_PART)
+    cancelled, uncancelled = _sizes_under(P, K), _sizes_under(P, 0 * K)
+    cancels = cancelled[0] * cancelled[1] < uncancelled[0] * uncancelled[1]
+    K, sizes = (K, cancelled) if cancels else (0 * K, uncancelled)
+    error, push = (share * size for size in sizes)
     C1 = np.vstack([P.C1, -error * K @ P.C2, error * np.eye(n)])
     D12 = np.vstack([P.D12, error * np.eye(m2), np.zeros((n, m2))])
     B1 = np.hstack([P.B1, -push * P.B2 @ K, push * np.eye(n)])
@@ -481,15 +483,11 @@ def regularise(plant: GeneralizedPlant, share: float) -> GeneralizedPlant:
     return replace(P, B1=B1, C1=C1, D11=D11, D12=D12, D21=D21)
 
 
-def _cancelling(plant: GeneralizedPlant) -> FloatArray:
-    """Return the constant control (m2, p2) that leaves least of D11, if it makes nothing larger."""
-    P = plant
-    K = -np.linalg.pinv(P.D12, rcond=_PART) @ P.D11 @ np.linalg.pinv(P.D21, rcond=_PART)
+def _sizes_under(P: GeneralizedPlant, K: FloatArray) -> tuple[float, float]:
+    """Return the sizes of errors and disturbances under a constant control (m2, p2)."""
     through = P.D11 + P.D12 @ K @ P.D21
-    cancelled = _size(P.C1 + P.D12 @ K @ P.C2, P.D12, through)
-    cancelled *= _size(P.B1 + P.B2 @ K @ P.D21, P.D21, through)
-    uncancelled = _size(P.C1, P.D12, P.D11) * _size(P.B1, P.D21, P.D11)
-    return K if cancelled < uncancelled else 0 * K
+    errors = _size(P.C1 + P.D12 @ K @ P.C2, P.D12, through)
+    return errors, _size(P.B1 + P.B2 @ K @ P.D21, P.D21, through)
 
 
 def _size(*parts: FloatArray) -> float:

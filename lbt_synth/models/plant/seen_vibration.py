@@ -188,10 +188,7 @@ def _frame_map(line: Vibration, dt_s: float, parts: Sequence[float]) -> list[Flo
 
 
 def _sampled(angle: float, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Return transition and root of the noise of [x, x', integral of x] over a unit of time.
-
-    The oscillator has the angular frequency ``angle``, the force a unit density.
-    """
+    """Return transition and noise root of [x, x', integral of x] for a force of unit density."""
     rates = np.array([[0.0, 1.0, 0.0], [-(angle**2), -2 * damping * angle, 0.0], [1.0, 0.0, 0.0]])
     generator = np.zeros((6, 6))
     generator[:3, :3], generator[3:, 3:], generator[1, 4] = -rates, rates.T, 1.0
