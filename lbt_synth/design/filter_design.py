@@ -44,11 +44,7 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.matrix_functions import relative_distance
-from lbt_synth.linear.riccati.filtering import (
-    gamma_riccati,
-    kalman_riccati,
-    meets_level,
-)
+from lbt_synth.linear.riccati.filtering import GammaEquation, gamma_riccati, kalman_riccati
 from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.loop.budget import model_covariances
 from lbt_synth.models import TipTiltPlant
@@ -76,8 +72,9 @@ def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
 
 def _check_least(evidence: Evidence, least: float) -> Iterator[Check]:
     """Check the least norm on both sides: the level above is met, the level below is not."""
-    problem, sides = evidence.design.problem, (-TOLERANCE, TOLERANCE)
-    meets = [meets_level(problem, least * (1 + side), evidence.kalman) for side in sides]
+    equation = GammaEquation(evidence.design.problem, evidence.kalman)
+    levels = least * (1 - TOLERANCE), least * (1 + TOLERANCE)
+    meets = [equation.trial(level).P is not None for level in levels]
     off = 0.0 if meets == [False, True] else np.inf
     how = "gamma-Riccati equation on both sides"
     yield Check("least norm of any filter, error", off, TOLERANCE, how)

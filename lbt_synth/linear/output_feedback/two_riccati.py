@@ -26,7 +26,7 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import NonFiniteError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant, invert_well_posed
-from lbt_synth.linear.infeasibility_proof import slow_angles
+from lbt_synth.linear.infeasibility_proof import slow_angles, steady_oscillation
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two, semidefinite_root
 from lbt_synth.linear.norms import hinf_norm
 from lbt_synth.linear.output_feedback.lower_bound import (
@@ -34,7 +34,6 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     WorstCase,
     coupled_bursts,
     last_step,
-    steady_pairs,
 )
 from lbt_synth.linear.riccati.dare import require_seen, solve_dare
 from lbt_synth.linear.riccati.equations import Equations, solve_by_doubling, solve_by_schur
@@ -236,12 +235,14 @@ class TwoRiccati:
                 ("unseen", plant.transposed(), estimation, solution.Y, _ESTIMATION),
             )
             for pairs, side, worst, cost, (reason, reason_at) in cases:
+                shown = side.A.T, side.C1.T, side.B2.T, side.D12.T
+                gained = side.B1.T, side.D11.T
                 if plant is self.plant:
                     with suppress(NonFiniteError):  # of a worst case that rounding makes unstable
                         burst = {pairs: last_step(worst, cost)}
                         out.append(ControlWitness(**burst, reason=reason))
                 for angle in (*slow_angles(worst.A)[:4], 0.0, np.pi):
-                    steady = {pairs: steady_pairs(side, angle)}
+                    steady = {pairs: steady_oscillation(shown, gained, angle)}
                     text = f"{reason_at} {angle / (2 * np.pi * plant.dt_s):.6g} Hz"
                     out.append(ControlWitness(**steady, reason=text))
             if plant is self.plant:

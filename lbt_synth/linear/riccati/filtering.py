@@ -309,11 +309,6 @@ def gamma_riccati(
     return equation.solution(gamma, equation.trial(gamma))
 
 
-def meets_level(problem: EstimationProblem, gamma: float, start: FilterRiccati) -> bool:
-    """Return whether a filter meets a level of gamma; ``start`` is the Kalman filter's solution."""
-    return GammaEquation(problem, start).trial(gamma).P is not None
-
-
 def least_gamma(
     problem: EstimationProblem, *, lower: float, upper: float, start: FilterRiccati | None = None
 ) -> tuple[float, float, FilterRiccati]:
