@@ -274,8 +274,7 @@ def run_robustness(arguments: Namespace) -> Report:
         figure=lambda: robustness_map_figure(maps),
     )
     pairs = [(name, int(np.sum(~grid.stable)), grid.stable.size) for name, grid in maps.items()]
-    headings = ("file", "unstable", "all")
-    report.add_table("Pairs of a sensor gain and a delay error", headings, pairs)
+    report.add_table("Pairs of a sensor gain and a delay error", ("file", "unstable", "all"), pairs)
     report.data["maps"] = {name: asdict(grid) for name, grid in maps.items()}
     return report
 

@@ -86,8 +86,7 @@ def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: flo
                 **margin_columns(margins),
             )
         )
-    records = report.data["designs"].items()
-    if unstable := [name for name, record in records if record["stable"] is False]:
+    if unstable := [n for n, one in report.data["designs"].items() if one["stable"] is False]:
         report.verdict.append(f"{unstable_text(unstable)} at this sensor gain.")
     falling = {name: -margins.modulus for name, margins in margins_of.items()}
     words = rank_names(falling, ", with the largest margin,", ", with the least margin,")

@@ -375,8 +375,7 @@ def write_files(
     )
     text = config_text(settings, comments).encode()
     for design in (designs or {}).values():
-        kept = keep_unit(design, record.diameter_m)
-        report.note_written(save_gain(places["gain"], kept))
+        report.note_written(save_gain(places["gain"], keep_unit(design, record.diameter_m)))
     report.note_written(write_atomically(places["model"], text))
     report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
     if "figure" in places:

@@ -122,8 +122,7 @@ def _run(
     drops = _parse_drops(arguments, name, design)
     differences = difference_notes(config, {name: design})
     how: dict[str, Any] = _choose_sizes(arguments, config, drops)
-    how |= {"drops": drops, "stroke": arguments.stroke}
-    how["estimates"] = arguments.form == "estimator"
+    how |= {"drops": drops, "stroke": arguments.stroke, "estimates": arguments.form == "estimator"}
     try:
         run = run_design(name, design, truth, config, **how)
     except UnstableLoopError as error:
