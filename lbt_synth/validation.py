@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import math
 import operator
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass
 from functools import cache, partial
+from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, TypeAlias, TypeVar, cast, get_args, get_type_hints
 
@@ -294,6 +296,13 @@ def text(value: Any, name: str) -> str:
     if not isinstance(value, str):
         raise ProblemError(f"{name} must be a text; got {value!r}.")
     return value
+
+
+def file_path(value: Any, name: str) -> Path:
+    """Return the path of a file; refuse what is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise ProblemError(f"{name} must be the path of a file; got {type(value).__name__}.")
+    return Path(value)
 
 
 def sequence(value: Any, name: str) -> tuple[Any, ...]:

@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3217,
-    "config": 1629,
-    "design": 6028,
-    "files": 1263,
-    "identification": 8956,
-    "interop": 3732,
-    "linear": 4766,
-    "loop": 3982,
-    "methods": 803,
-    "models": 3771,
-    "report": 3351,
-    "storage": 1134,
-    "studies": 3200,
-    "errors, validation": 555,
+    "cli": 3204,
+    "config": 1620,
+    "design": 6034,
+    "files": 1273,
+    "identification": 8969,
+    "interop": 3694,
+    "linear": 4760,
+    "loop": 3979,
+    "methods": 802,
+    "models": 3810,
+    "report": 3531,
+    "storage": 1164,
+    "studies": 3171,
+    "errors, validation": 564,
 }
 COUNTS = {
-    "files of the package": 204,
+    "files of the package": 205,
     "public names": 147,
-    "tuned constants": 502,
-    "lines of tests": 25007,
+    "tuned constants": 504,
+    "lines of tests": 24846,
     "lines of benchmarks": 3998,
-    "words of docs": 60055,
+    "words of docs": 60166,
 }
 
 

@@ -156,10 +156,6 @@ _TABLE = """
     >
     --pdf | switch | write the page as a PDF, too (summary.pdf)
     --row | int | recompute one row, and write it as a configuration
-  mirror | comparisons | Show how the mirror settles, and what ignoring its dynamics costs.
-    unit config
-    --tolerance | float =0.1 | half width of the band in which the mirror counts as settled
-    outputs
   modal | comparisons | Compare integrators, optimised gains and Kalman filters for all modes.
     unit config
     --modes | int | number of modes, at least 2 (default: mirror.modes)
@@ -223,6 +219,10 @@ _TABLE = """
     jobs
     --seeds | int =3 | seeds of Table II and of 20 Hz
     --row-seeds | int =1 | seeds of the other rows
+  mirror | comparisons | Show how the mirror settles, and what ignoring its dynamics costs.
+    unit config
+    --tolerance | float =0.1 | half width of the band in which the mirror counts as settled
+    outputs
 """
 
 
@@ -258,7 +258,7 @@ _GROUPS = {  # by the first command of each
     "show": "prove: what a gain file holds, and whether it is true",
     "telemetry": "records: from what a loop recorded to a model and a design",
     "export": "at the telescope: a gain file in another program",
-    "paper": "the paper and the simulator: Agapito et al. 2008, and loops with a pyramid",
+    "paper": "the paper and the simulator: Agapito et al. 2008, a pyramid, and a slow mirror",
 }
 _CHOICES = {  # what an argument may be: a tuple, or the function that returns it, slow to import
     "units": UNITS,
@@ -352,8 +352,17 @@ def _add_method_options(parser: ArgumentParser) -> None:
     """Add ``--method`` and the options of all methods; each method checks its own."""
     from lbt_synth.methods.registry import METHODS, option_names
 
-    titles = "; ".join(f"{name}: {method.title}" for name, method in METHODS.items())
-    parser.add_argument("--method", choices=tuple(METHODS), required=True, help=titles)
+    def designed(name: str) -> str:
+        if name in METHODS and METHODS[name].of_record:
+            raise argparse.ArgumentTypeError(
+                f"{name} is made of a record, and not of a configuration alone. Try lbt-synth auto "
+                f"RECORD --method {name}"
+            )
+        return name
+
+    choices = [name for name, method in METHODS.items() if not method.of_record]
+    titles = "; ".join(f"{name}: {METHODS[name].title}" for name in choices)
+    parser.add_argument("--method", type=designed, choices=choices, required=True, help=titles)
     for name in option_names():
         owners: dict[str, list[str]] = {}
         for method in METHODS.values():

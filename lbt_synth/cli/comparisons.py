@@ -23,11 +23,12 @@ from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_title, referen
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures import studies as figures
+from lbt_synth.report.screen import say_limit, say_maps, say_residual
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
-from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.limits import LimitStudy, limits, limits_at_rate, say_residual
-from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, compare_modes, compare_on_mirror
+from lbt_synth.storage.words import listing_text, unstable_text
+from lbt_synth.studies.limits import LimitStudy, limits, limits_at_rate
+from lbt_synth.studies.robustness import FAMILIES, compare_modes, compare_on_mirror
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _RATES = 34  # frame rates of a comparison, of which a table without --verbose has every third
@@ -75,8 +76,7 @@ def _begin(designs: Mapping[str, Design], config: Config) -> tuple[Report, Limit
     )
     report = Report(data={"limit_nm": None if study.limit is None else study.limit.rms_nm})
     if unstable := [row.design for row in study.rows if not row.stable]:
-        verb = "is" if len(unstable) == 1 else "are"
-        report.verdict.append(f"{listing_text(unstable)} {verb} unstable in the truth.")
+        report.verdict.append(f"{unstable_text(unstable)} in the truth.")
     if stable := [row for row in study.rows if row.stable]:
         best = min(stable, key=lambda row: row.residual_nm)
         report.verdict.append(say_residual(best.design, best, study.limit))
@@ -118,7 +118,7 @@ def run_limits(arguments: Namespace) -> Report:
             f"infinite order achieves {nm_text(study.band.achieved_nm, '.6g')}."
         )
     if study.limit is not None:
-        report.notes.append(loop_inputs.say_limit(study.limit, config))
+        report.notes.append(say_limit(study.limit, config))
     else:
         report.notes.append(
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
@@ -211,7 +211,8 @@ def run_mirror(arguments: Namespace) -> Report:
     frames = step.settling_s / hardware.dt_s
     best = min((row for row in rows if row.stable), key=lambda row: float(row.residual_nm))
     report = Report(data={"taps": hardware.mirror_taps})
-    report.verdict = [f"{row.design}: unstable on this mirror." for row in rows if not row.stable]
+    unstable = [row.design for row in rows if not row.stable]
+    report.verdict = [f"Unstable on this mirror: {'; '.join(unstable)}."] * bool(unstable)
     report.verdict += [
         f"{best.design} leaves least, {nm_text(best.residual_nm, '.1f')} rms (Strehl ratio "
         f"{100 * best.strehl:.1f} %).",
@@ -266,30 +267,17 @@ def run_robustness(arguments: Namespace) -> Report:
     where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
     caption = f"At a sensor gain of {gains[real]:.3g}: {config.imaging.label}, over {where}"
     report = Report(
-        verdict=_say_maps(maps, real, where),
+        verdict=say_maps(maps, real, where),
         tables=[row_table(caption, lines)],
         notes=difference_notes(config, designs),
         rows=[point for name, grid in maps.items() for point in grid.points(name)],
         figure=lambda: robustness_map_figure(maps),
     )
+    pairs = [(name, int(np.sum(~grid.stable)), grid.stable.size) for name, grid in maps.items()]
+    headings = ("file", "unstable", "all")
+    report.add_table("Pairs of a sensor gain and a delay error", headings, pairs)
     report.data["maps"] = {name: asdict(grid) for name, grid in maps.items()}
     return report
-
-
-def _say_maps(maps: Mapping[str, RobustnessMap], real: int, where: str) -> list[str]:
-    """Return where designs are unstable, and which keeps the highest Strehl ratio at worst."""
-    verdict = [
-        f"{name} is unstable at {count} of {grid.stable.size} pairs of a sensor gain and a delay "
-        "error of its map."
-        for name, grid in maps.items()
-        if (count := np.count_nonzero(~grid.stable))
-    ]
-    lowest = {name: float(np.min(grid.strehl[:, real])) for name, grid in maps.items()}
-    best = max(lowest, key=lambda name: np.nan_to_num(lowest[name]))  # nan is unstable
-    if lowest[best] > 0:
-        percent = f"{100 * lowest[best]:.1f} %"
-        verdict.append(f"{best} keeps the highest Strehl ratio at worst over {where}, {percent}.")
-    return verdict
 
 
 def _parse_range(

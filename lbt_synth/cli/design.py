@@ -18,9 +18,10 @@ from lbt_synth.cli.loop_inputs import (
     load_shown,
     say_accelerometers,
 )
-from lbt_synth.cli.output import Report, say_checks
+from lbt_synth.cli.output import Report
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
+from lbt_synth.design.certificate import say_checks
 from lbt_synth.design.result import without_units
 from lbt_synth.errors import NumericalError
 from lbt_synth.files import save_gain

@@ -29,8 +29,10 @@ def run_init(arguments: Namespace) -> Report:
     if arguments.examples:
         folder = make_directory(arguments.output or "examples")
         contents = {folder / name: text for name, text in sorted(example_files().items())}
+        file, first = folder / "lbt.yaml", ""
     else:
         output = arguments.output or f"{telescope}.yaml"
+        first = "put in your own numbers; then "
         file = require_ending(output, "a configuration", (".yaml", ".yml"))
         schema = file.with_name(_SCHEMA)
         require_writable(file, schema)
@@ -38,11 +40,11 @@ def run_init(arguments: Namespace) -> Report:
             file: f"# yaml-language-server: $schema={_SCHEMA}\n{telescope_template(telescope)}",
             schema: json.dumps(config_schema(), indent=1) + "\n",
         }
-        method = default_method()
-        report.verdict.append(
-            f"Next, put in your own numbers; then lbt-synth design {file} --method {method} "
-            f"-o {file.with_name(f'{file.stem}_{method}.fits')} makes a controller."
-        )
+    method = default_method()
+    report.verdict.append(
+        f"Next, {first}lbt-synth design {file} --method {method} "
+        f"-o {file.with_name(f'{file.stem}_{method}.fits')} makes a controller."
+    )
     _refuse_taken(contents, force=arguments.force)
     report.note_written(*write_together({at: text.encode() for at, text in contents.items()}))
     return report

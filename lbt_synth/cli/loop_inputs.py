@@ -10,22 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.output import Report, say_checks
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
+from lbt_synth.design.certificate import say_checks
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.loop.least_residual import ResidualLimit
 from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.report.screen import say_limit, say_residual
 from lbt_synth.storage.display_unit import LENGTHS, nm_text, show_in, shown_unit
 from lbt_synth.storage.rows import Column, fact
-from lbt_synth.studies.limits import compare_in_truth, say_residual
+from lbt_synth.studies.limits import compare_in_truth
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
@@ -150,16 +151,10 @@ def difference_notes(config: Config, designs: Mapping[str, Design]) -> list[str]
 
 def add_certificate(report: Report, design: Design) -> None:
     """Add whether a design passed its certificate, and what it assumes."""
-    report.verdict.append(say_checks(design.certificate.checks))
+    place = len(report.verdict) if design.certificate.passed else 0  # a failure comes first
+    report.verdict.insert(place, say_checks(design.certificate.checks))
     report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
-
-
-def say_limit(limit: ResidualLimit, config: Config) -> str:
-    """Return the sentence on the limit of a truth."""
-    least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
-    own = " of the loop's own sensor" * bool(config.hardware.suite.sensors)
-    return f"least residual of any linear controller{own} in the truth: {least}"
 
 
 def add_truth(
@@ -191,7 +186,8 @@ def add_truth(
         )
         if slow := [other for other in others if other.design == _BASELINE and other.stable]:
             residual = nm_text(slow[0].residual_nm, ".1f")
-            report.verdict[-1] += f" The best {_BASELINE} leaves {residual}."
+            said = report.verdict[-1].removesuffix(".")
+            report.verdict[-1] = f"{said}; the best {_BASELINE} leaves {residual}."
     else:
         report.verdict.append(f"{warnings[0][0].upper()}{warnings[0][1:]} of {config.source.name}.")
         warnings = warnings[1:]

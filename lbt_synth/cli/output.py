@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import Any
 
@@ -18,6 +19,7 @@ import numpy as np
 from lbt_synth.cli.arguments import input_files
 from lbt_synth.cli.streams import printable
 from lbt_synth.report.draw import FIGURE_ENDINGS, save_figure
+from lbt_synth.report.screen import brief_table
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.rows import (
     cell_text,
@@ -31,6 +33,8 @@ from lbt_synth.storage.tables import Table, text_lines
 
 _WIDTH = 200  # columns of --verbose where the output is no terminal
 _BRIEF_WIDTH, _BRIEF_LINES, BRIEF_ROWS = 100, 25, 12  # without --verbose: a screen
+BRIEF_SENTENCES = 3  # of the verdict on it
+_NEXT_SENTENCE = re.compile(r"(?<=\.) (?=\S)")
 _WRITTEN = "written: "
 # what of the notes is printed without --verbose, in this order: the first two whole, if they fit
 # into some lines, else two lines of each
@@ -113,7 +117,7 @@ class Report:
         lacks_line = "─".encode(sys.stdout.encoding or "utf-8", "replace") == b"?"
         rule = "-" if lacks_line else "─"
         for line in self._all(room, rule) if verbose else self._brief(room, rule):
-            print(printable(line))
+            print(printable(line.replace("…", "~") if lacks_line else line))
 
     def _all(self, room: int, rule: str) -> Iterator[str]:
         """Yield all that there is to say."""
@@ -130,7 +134,8 @@ class Report:
         written = [f"{_WRITTEN}{', '.join(files)}"] if files else []
         if files and len(written[0]) > room and len(files) > 1:
             written = [f"{_WRITTEN}{len(files)} files, {files[0]} to {files[-1]}"]
-        verdict = _wrapped(" ".join(self.verdict), room)
+        sentences = _NEXT_SENTENCE.split(" ".join(self.verdict))
+        verdict = _wrapped(" ".join(sentences[:BRIEF_SENTENCES]), room)
         *urgent, notes = ([n for n in self.notes if n.startswith(mark)] for mark in _URGENT)
         kept = [line for marks in urgent for note in marks for line in _wrapped(note, room)]
         if len(kept) > _URGENT_LINES:  # the ends of sentences are left out, no sentence
@@ -140,12 +145,13 @@ class Report:
         most = max(space - 1 - len([*verdict, *kept]), 0)
         table: list[str] = []
         for count in range(BRIEF_ROWS, 1, -1) if self.tables else ():
-            thinned = text_lines(_thinned(self.tables[0], count), room, rule=rule)
-            table = [""] * bool(verdict) + thinned
+            brief = brief_table(self.tables[0], room, count, " ".join(verdict))
+            table = [""] * bool(verdict) + text_lines(brief, room, rule=rule)
             if len(table) <= most:
                 break
         lines, more = verdict + table[:most] + kept, [_wrapped(note, room) for note in notes]
         hidden = len(lines) + sum(map(len, more)) > space or len(table) > most
+        hidden |= len(sentences) > BRIEF_SENTENCES
         while more and len(lines) + len(more[0]) <= space - hidden:  # no sentence is cut
             lines += more.pop(0)
         if hidden:
@@ -158,25 +164,6 @@ def _wrapped(text: str, room: int, **cut: Any) -> list[str]:
     joined = text.replace(" %", "\u00a0%")
     lines = wrap(joined, room, break_long_words=False, break_on_hyphens=False, **cut)
     return [line.replace("\u00a0", " ") for line in lines]
-
-
-def _thinned(table: Table, most: int) -> Table:
-    """Return a table with so many rows: from end to end, and of facts the first and weightiest."""
-    count = len(table.rows)
-    if count <= most:
-        return table
-    facts = table.headings[0] == "quantity"
-    places = np.linspace(0, (most if facts else count) - 1, most).round().astype(int)
-    rows = tuple(table.rows[place] for place in places)
-    caption = f"{table.caption} ({len(rows)} of {count} rows; the others with --verbose)"
-    return replace(table, caption=caption, rows=rows)
-
-
-def say_checks(checks: Sequence[Any]) -> str:
-    """Return how many checks of a certificate passed, in a sentence."""
-    passed = sum(check.passed for check in checks)
-    failed = "" if passed == len(checks) else f"; {len(checks) - passed} FAILED"
-    return f"{passed} of {len(checks)} checks passed{failed}."
 
 
 def json_value(value: Any) -> Any:

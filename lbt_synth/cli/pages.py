@@ -30,6 +30,7 @@ from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.rows import fact, facts, json_record, json_units, row_table
+from lbt_synth.storage.words import rank_names, unstable_text
 from lbt_synth.validation import integer
 
 # what JSON has as a key, among the margins, or as numbers in place of words
@@ -67,7 +68,7 @@ def run_plot(arguments: Namespace) -> Report:
 
 
 def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
-    lines = []
+    lines, margins_of = [], dict[str, LoopMargins]()
     report.data |= {"gain_factor": gain_factor, "designs": {}}
     for name, design in designs.items():
         margins = stable = None
@@ -75,9 +76,7 @@ def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: flo
             loop = close_loop(design.hardware, design.controller, sensor_gain=gain_factor)
             stable, margins = loop.is_stable, loop_margins(loop) if loop.is_stable else None
         if margins is not None:
-            report.verdict.append(f"{name} {margins.survival}")
-        elif stable is False:
-            report.verdict.insert(0, f"{name} is unstable at this sensor gain.")
+            margins_of[name] = margins
         record = {} if margins is None else json_record(margins)
         report.data["designs"][name] = {"method": design.method, "stable": stable} | record
         lines.append(
@@ -87,6 +86,12 @@ def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: flo
                 **margin_columns(margins),
             )
         )
+    records = report.data["designs"].items()
+    if unstable := [name for name, record in records if record["stable"] is False]:
+        report.verdict.append(f"{unstable_text(unstable)} at this sensor gain.")
+    falling = {name: -margins.modulus for name, margins in margins_of.items()}
+    words = rank_names(falling, ", with the largest margin,", ", with the least margin,")
+    report.verdict += [f"{name}{said} {margins_of[name].survival}" for name, said in words.items()]
     report.data["units"] = report.data.get("units", {}) | json_units(LoopMargins)
     caption = f"Margins at {gain_factor:g} times the sensor gain that each design assumes"
     report.tables.append(row_table(caption, lines))

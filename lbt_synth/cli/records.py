@@ -83,7 +83,7 @@ def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | Spec
     white = all(axis.whiteness.white for axis in model.axes)
     leaves = "is white: the model is enough" if white else "is not white: the model lacks something"
     said = "No vibration stands out of the turbulence and the noise."
-    if lines := model.parts:
+    if lines := [part for part in model.parts if part.kind != "turbulence"]:
         strongest = max(lines, key=lambda line: line.rms_nm)
         said = (
             f"{count_text(len(lines), 'vibration')}, the strongest of "
@@ -231,7 +231,7 @@ def run_diagnose(arguments: Namespace) -> Report:
         judge_channels,
         live_axes,
     )
-    from lbt_synth.report.pages import diagnosis_page, diagnosis_rows
+    from lbt_synth.report.pages import diagnosis_page, diagnosis_rows, say_diagnosis
 
     if arguments.output is not None:
         require_page_names(arguments.output, arguments.pdf, inputs=input_files(arguments))
@@ -264,7 +264,7 @@ def run_diagnose(arguments: Namespace) -> Report:
             "best": diagnosis.best or None,
             "notes": diagnosis.notes,
         },
-        verdict=list(diagnosis.verdict),
+        verdict=say_diagnosis(diagnosis, designs),
         notes=[marked_note(note) for note in diagnosis.notes],
     )
     for _, key, caption, rows in diagnosis_rows(diagnosis):

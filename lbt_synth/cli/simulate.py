@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from lbt_synth.cli.arguments import given_options, input_files, refuse_options
 from lbt_synth.cli.loop_inputs import difference_notes, load_designs, load_shown
-from lbt_synth.cli.output import Report
+from lbt_synth.cli.output import BRIEF_SENTENCES, Report
 from lbt_synth.cli.telemetry import write_telemetry
 from lbt_synth.config import Config
-from lbt_synth.design import Design, integrator
-from lbt_synth.errors import GainFileError, LbtSynthError, ProblemError, UnstableLoopError
+from lbt_synth.design import Design
+from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.loop import ClosedLoop
@@ -24,13 +24,12 @@ from lbt_synth.loop.budget import residual_spectrum
 from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
+from lbt_synth.report.screen import say_references, say_runs
 from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
-from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Facts
-from lbt_synth.storage.words import count_text
-from lbt_synth.studies.limits import limits
+from lbt_synth.storage.words import count_text, unstable_text
 from lbt_synth.studies.runs import DesignRun, run_design
 
 _TIME = r"(\d+\.?\d*)s?"
@@ -73,8 +72,15 @@ def run_simulate(arguments: Namespace) -> Report:
         (design,) = designs.values()
         loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
         spectrum = tiptop_spectrum(loop, truth)
-    runs = [_run(arguments, name, design, truth, config) for name, design in designs.items()]
-    report = _describe_runs(runs, truth, config)
+    runs, unstable = list[DesignRun](), dict[str, UnstableLoopError]()
+    for name, design in designs.items():
+        try:
+            runs.append(_run(arguments, name, design, truth, config))
+        except UnstableLoopError as error:
+            unstable[name] = error
+            if len(unstable) == count:
+                raise
+    report = _describe_runs(runs, unstable, truth, config)
     design, (_, simulation, segments, _) = next(iter(designs.values())), runs[0]
     report.figure = lambda: _draw(design, simulation, segments)
     if arguments.telemetry is not None:
@@ -121,26 +127,27 @@ def _run(
     try:
         run = run_design(name, design, truth, config, **how)
     except UnstableLoopError as error:
-        why = " ".join([str(error), *differences])
+        why = " ".join([f"{name}: {error}", *differences])
         raise UnstableLoopError(why, spectral_radius=error.spectral_radius) from error
     return run._replace(notes=[*(f"note: {note}" for note in run.notes), *differences])
 
 
-def _describe_runs(runs: Sequence[DesignRun], truth: Truth, config: Config) -> Report:
+def _describe_runs(
+    runs: Sequence[DesignRun], unstable: Mapping[str, Exception], truth: Truth, config: Config
+) -> Report:
     """Return a line for each gain file, and the parts between failures of a single one."""
     rows, (_, first, segments, _) = [row for row, *_ in runs], runs[0]
     cases, frames = first.residual_nm.shape[:2]
     report = Report(data={"frames": frames, "cases": cases, "seed": first.seed})
     report.data["wavelength_um"] = config.imaging.wavelength_um
     report.data["sensor_gain"] = config.sensor_gain * truth.sensor_gain
-    for row in rows:
-        residual = nm_text(row.residual_simulated_nm, ".1f")
-        said = f"{row.design} leaves {residual} rms (Strehl ratio {100 * row.strehl_simulated:.1f}"
-        said += " %)"
-        if row.residual_exact_nm is not None:
-            said += f", and {nm_text(row.residual_exact_nm, '.1f')} without chance"
-        report.verdict.append(f"{said}.")
-    report.verdict += _say_references(truth, config)
+    said = say_runs(rows)
+    if unstable:
+        report.verdict.append(f"{unstable_text(list(unstable))} at this sensor gain.")
+        report.notes += [f"note: {error}" for error in unstable.values()]
+        rows += [Facts(rows[0].columns, {"design": name}) for name in unstable]
+    most = BRIEF_SENTENCES - 1 - len(report.verdict)
+    report.verdict += [*said[:most], *say_references(truth, config), *said[most:]]
     caption = f"{count_text(cases, 'run')} of {frames} frames; {config.imaging.label}"
     report.add_rows("designs", caption, rows)
     report.rows, report.without = rows, ("cases_residual_nm", "cases_strehl")
@@ -154,21 +161,6 @@ def _describe_runs(runs: Sequence[DesignRun], truth: Truth, config: Config) -> R
             "note: a vibration drifts, so there is no exact answer beside the simulation."
         )
     return report
-
-
-def _say_references(truth: Truth, config: Config) -> list[str]:
-    """Say what the best controllers of the loop's own sensor leave, if there are any."""
-    alone = config.hardware.own_sensor_alone()
-    try:
-        study = limits({"": integrator(alone, truth=truth)}, alone, truth, config.imaging)
-    except LbtSynthError:
-        return []
-    said = f"The best integrator leaves {nm_text(study.rows[0].residual_nm, '.1f')}"
-    if study.limit is not None:
-        said += f", the best linear controller {nm_text(study.limit.rms_nm, '.1f')}"
-    if config.hardware.suite.sensors:
-        said += ", both by the loop's own sensor alone"
-    return [f"{said}."]
 
 
 def _draw(design: Design, simulation: Simulation, segments: Sequence[tuple[Segment, Facts]]) -> Any:

@@ -16,12 +16,16 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, print_error
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
-from lbt_synth.report.pages import replay_table, study_verdict
+from lbt_synth.report.pages import controller_table, replay_table, study_verdict
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.executors import choose_engine
-from lbt_synth.storage.words import duration_text
+from lbt_synth.storage.words import duration_text, listing_text
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
-from lbt_synth.studies.study.statistics import study_statistics, summary_tables, worst_table
+from lbt_synth.studies.study.statistics import (
+    study_statistics,
+    summary_tables,
+    worst_table,
+)
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import integer
 
@@ -80,6 +84,7 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         },
         verdict=study_verdict(statistics),
         tables=[
+            controller_table(statistics),
             *summary_tables(statistics),
             *(replace(table, rows=table.rows[:_WORST]) for table in worst),
         ],
@@ -102,11 +107,12 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     report = Report(
         data={"row": row, "parameters": values, "stored": stored, "fresh": fresh}
         | {"failures": [dict(zip(_FAILURE, failure, strict=True)) for failure in replay.failures]},
-        notes=[
-            *([] if stored else ["note: the study has no result of this row yet."]),
-            *(f"warning: failed: {name}: {error}" for _, name, error in replay.failures),
-        ],
+        notes=[f"warning: failed: {name}: {error}" for _, name, error in replay.failures],
     )
+    said = "gives what is stored" if stored else "has no stored results to compare with"
+    if replay.changed:
+        said = f"does not give what is stored of {listing_text(replay.changed, 3)}"
+    report.verdict.append(f"Row {row}, computed again, {said}.")
     report.tables.append(replay_table(replay, row, loaded.result_columns))
     report.note_written(*replay.files)
     return report

@@ -10,8 +10,9 @@ import numpy as np
 
 from lbt_synth.cli.arguments import given_options, input_files, refuse_options
 from lbt_synth.cli.loop_inputs import load_designs
-from lbt_synth.cli.output import Report, say_checks
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.telemetry import load_series, record_imaging, require_series
+from lbt_synth.design.certificate import say_checks
 from lbt_synth.errors import GainFileError
 from lbt_synth.files import load_gain
 from lbt_synth.identification.records.record import require_length

@@ -31,7 +31,7 @@ from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import FloatArray, choice
+from lbt_synth.validation import FloatArray, choice, file_path
 
 if TYPE_CHECKING:
     from lbt_synth.design import Design
@@ -198,7 +198,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     >>> config.hardware.frame_rate_hz, config.plant.A.shape
     (800.0, (8, 8))
     """
-    source = Path(path)
+    source = file_path(path, "a configuration")
     return build_config(validate_sections(FileSection, read_mapping(source), source), source)
 
 

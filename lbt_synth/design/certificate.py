@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -254,3 +254,10 @@ def measured_claim(name: str, heading: str) -> Claim:
         yield Check(f"{heading}, against the one claimed", apart, TOLERANCE, "relative")
 
     return Claim(name=name, heading=heading, unit="nm", checks=checks)
+
+
+def say_checks(checks: Sequence[Check]) -> str:
+    """Return how many checks of a certificate passed, in a sentence."""
+    passed = sum(check.passed for check in checks)
+    failed = "" if passed == len(checks) else f"; {len(checks) - passed} FAILED"
+    return f"{passed} of {len(checks)} checks passed{failed}."

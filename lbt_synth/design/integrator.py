@@ -211,9 +211,8 @@ def integrator(
 ) -> IntegratorDesign:
     """Integrator ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
 
-    R is the pseudoinverse of the sensor matrix times the influence matrix; combinations of commands
-    that no measurement sees stay zero. The gain is given; or leaves the least residual for a truth;
-    or is the largest one that keeps the margins of the law.
+    R is the pseudoinverse of sensor times influence matrix; what no reading sees stays zero. The
+    gain is given, leaves the least residual for a truth, or is the largest that keeps the margins.
 
     Parameters
     ----------
@@ -318,7 +317,7 @@ def integrator_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> 
     >>> [round(lbt.design.integrator_gain_limit(path), 3) for path in paths]
     [1.0, 0.618, 0.445]
     """
-    single = hardware.single_mode()
+    single = require_instance(hardware, LoopHardware, "hardware").single_mode()
     taps = single.mirror_taps
     mean_delay_frames = 1 + float(np.abs(np.arange(taps.size) @ taps))
     gain = least = 0.5 / mean_delay_frames

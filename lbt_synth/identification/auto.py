@@ -185,7 +185,7 @@ def design_from_record(
     mixed = identify(split_halves(record)[0], **options)
     half = mixed.separated() if separate_axes else mixed
     if finds_gain := record.commands is not None and sensor_gain is None:
-        assumptions += _judge_gains(half, accept_record)
+        assumptions += _judge_gains(half, accept_record, record.read_with)
     step(1)
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}
@@ -290,10 +290,11 @@ def _judge_commands(
     return list(verdict.notes), assumptions
 
 
-def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
+def _judge_gains(model: IdentifiedModel, accept: bool, read_with: str) -> tuple[str, ...]:
     """Return what is assumed of fitted gains; refuse those of commands in another unit."""
     errors = np.array([axis.sensor_gain_error or np.inf for axis in model.axes])
     verdict = judge_fitted_gains(np.array(model.sensor_gains), errors)
+    verdict = replace(verdict, read_with=read_with)
     if not accept:
         verdict.require_accepted()
     return verdict.overruled

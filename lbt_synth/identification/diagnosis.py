@@ -105,7 +105,7 @@ def _judge_channel(
     first, last = end_scatters(values[:, axis], good)
     change, quarter = last / first if first > 0 else np.nan, len(channel) // 4
     drift_nm = np.mean(channel[-quarter:]) - np.mean(channel[:quarter]) if quarter else np.nan
-    words = [f"{_WORDS[kind]} ({100 * share:.2g} %)" for kind, share in faults.items()]
+    words = [f"{_WORDS[kind]} ({100 * share:.3g} %)" for kind, share in faults.items()]
     if np.ptp(channel) == 0 or faults.get("stuck", 0.0) > 1 / 2:
         words = [DEAD]
     elif series == "measurements":
@@ -442,7 +442,7 @@ def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
     bad = [row for row in diagnosis.channels if row.serious]
     faults = [f"the {row.channel} is {row.state}" for row in bad]
     if diagnosis.record.lost > FEW:
-        faults.append(f"{100 * diagnosis.record.lost:.2g} % of the frames are lost")
+        faults.append(f"{100 * diagnosis.record.lost:.3g} % of the frames are lost")
     if faults:
         advice = f"First look at the {bad[0].channel}, which is {bad[0].state}." if bad else ""
         yield Finding(sentence=f"The record has faults: {'; '.join(faults)}.", advice=advice)
@@ -473,6 +473,8 @@ def _judge_loop(diagnosis: Diagnosis) -> Finding:
     law, loop = "an open loop ran", diagnosis.loop
     if diagnosis.law is not None:
         law = f"{diagnosis.law.name} ran{diagnosis.law.lag_text}"
+    elif diagnosis.commands is not None:
+        law = "so few frames do not tell which law ran"
     if loop is None:
         return Finding(tone="note", sentence=f"The record shows no fault, and {law}.")
     gain = f"at the sensor gain of {loop.sensor_gain}"

@@ -275,7 +275,7 @@ class LoopMargins(Summarised):
             if frames < FRAGILE_FRAMES:
                 texts.append(
                     f"{frames:.2g} frames ({frames * 1e6 * self.dt_s:.2g} us) {word} delay make "
-                    "this loop unstable. Do not close it so: take another method, or robust with "
+                    "this loop unstable; do not close it so: take another method, or robust with "
                     "delay_error_frames."
                 )
         if (least := min(self.gain_errors_db)) < FRAGILE_DB:

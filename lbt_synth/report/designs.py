@@ -33,12 +33,13 @@ from lbt_synth.report.page.html import (
     survival_blocks,
     words,
 )
+from lbt_synth.report.screen import say_residual
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, columns, fact, facts, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import robustness_map
-from lbt_synth.studies.limits import LimitStudy, compare_in_truth, say_residual
+from lbt_synth.studies.limits import LimitStudy, compare_in_truth
 from lbt_synth.studies.robustness import RobustnessMap
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 

@@ -47,13 +47,14 @@ from lbt_synth.report.draw import GREY, colour, dashes
 from lbt_synth.report.figures.loops import frequency_grid
 from lbt_synth.report.figures.records import SEGMENT, exact_spectrum
 from lbt_synth.report.page.html import creator_name
+from lbt_synth.report.screen import say_residual
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.tables import Table, text_lines
 from lbt_synth.storage.words import count_text
 from lbt_synth.studies import robustness_map
-from lbt_synth.studies.limits import compare_in_truth, say_residual
+from lbt_synth.studies.limits import compare_in_truth
 from lbt_synth.validation import FloatArray
 
 Curve: TypeAlias = tuple[FloatArray, FloatArray]  # abscissae and ordinates, in units that are shown

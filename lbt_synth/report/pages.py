@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -37,7 +37,7 @@ from lbt_synth.report.page.html import (
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import cell_text, row_table
 from lbt_synth.storage.tables import Table
-from lbt_synth.storage.words import count_text, duration_text
+from lbt_synth.storage.words import count_text, duration_text, listing_text
 from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study.run import Replay
 from lbt_synth.studies.study.statistics import (
@@ -177,11 +177,14 @@ def study_verdict(statistics: StudyStatistics) -> list[str]:
     with_data = [one for one in statistics.controllers if one.samples]
     if not with_data:
         return ["No controller was evaluated on any sample."]
-    verdict = [
-        f"{one.controller} is unstable in {percent(one.unstable_share.value, 2)} % of the samples."
-        for one in sorted(with_data, key=lambda one: -one.unstable)
-        if one.unstable
-    ]
+    verdict = []
+    if unstable := sorted((c for c in with_data if c.unstable), key=lambda c: -c.unstable):
+        first, *others = (f"{percent(c.unstable_share.value, 2)} %" for c in unstable)
+        verdict = [f"{unstable[0].controller} is unstable in {first} of the samples."]
+        if others:
+            names = listing_text([c.controller for c in unstable[1:]], 2)
+            most = "at most " * (len(others) > 1)
+            verdict = [f"{verdict[0][:-1]}, and {names} in {most}{others[0]}."]
     measures: dict[str, Callable[[ControllerStatistics], float]] = {
         "mean": lambda one: one.mean,
         "median": lambda one: one.strehl[50].value,
@@ -200,6 +203,21 @@ def study_verdict(statistics: StudyStatistics) -> list[str]:
             "variance)."
         )
     return verdict
+
+
+def controller_table(statistics: StudyStatistics) -> Table:
+    """Return a line for each controller."""
+    kinds = ("mean", "+-", "5th", "median", "95th", "unstable")
+    rows = []
+    for one in statistics.controllers:
+        low, median, high = (one.strehl[p].value for p in (5, 50, 95))
+        values = (one.mean, one.mean_error, low, median, high, one.unstable_share.value)
+        rows.append((one.controller, *(percent(value, 2) for value in values), str(one.failed)))
+    return Table(
+        caption="Strehl ratio over the samples, with percentiles; an unstable loop counts as 0",
+        headings=("controller", *(f"{kind} [%]" for kind in kinds), "failed"),
+        rows=tuple(rows),
+    )
 
 
 def replay_table(replay: Replay, row: int, names: Sequence[str]) -> Table:
@@ -406,3 +424,16 @@ def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str] = ()) -> Page:
         },
         sources=list(zip(files, ("record", "gain file"), strict=False)),
     )
+
+
+def say_diagnosis(diagnosis: Diagnosis, given: Collection[str]) -> list[str]:
+    """Say the record's state, its residual and what to change, and then what else is known."""
+    *states, residual = diagnosis.findings
+    faults = [state.sentence for state in states if state.tone == "bad"]
+    tried = [(row.name, row.replayed) for row in diagnosis.residuals if row.name in given]
+    leave = "".join(f"; {name} would leave {replay.text}" for name, replay in tried if replay)
+    verdict = [f"{residual.sentence[:-1]}{leave}.", diagnosis.verdict[-1]]
+    if len(faults) > 1:  # of which nothing follows for the residual
+        verdict.reverse()
+    verdict = [*(faults or [states[0].sentence]), *verdict]
+    return [*verdict, *(state.sentence for state in states if state.sentence not in verdict)]

@@ -13,6 +13,7 @@ from typing import BinaryIO
 
 from lbt_synth.errors import FileError, OutputError
 from lbt_synth.storage.input_files import error_text
+from lbt_synth.validation import file_path
 
 try:
     import fcntl
@@ -29,7 +30,7 @@ def require_ending(
     error: type[FileError] = OutputError,
 ) -> Path:
     """Return the path of a file; refuse it where it has none of the endings."""
-    target = Path(path)
+    target = file_path(path, what)
     if target.suffix.lower() not in endings:
         raise error(f"{what} must end in {', '.join(endings)}; got {target.name!r}.", path=target)
     return target

@@ -6,7 +6,7 @@ import contextlib
 import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from textwrap import wrap
 from typing import Any
@@ -31,6 +31,7 @@ class Table:
     headings: tuple[str, ...]  # one per column, the first over the headings of the rows
     rows: tuple[tuple[str | Cell, ...], ...]  # a single cell is a heading of the rows below
     words: tuple[int, ...] = ()  # columns set flush left, besides the first
+    gap: int = 3  # letters between columns of text
 
     def cells(self) -> Iterator[tuple[Cell, ...]]:
         """Rows with every text as a cell."""
@@ -39,18 +40,21 @@ class Table:
 
     def by_columns(self, most: int) -> Iterator[Table]:
         """Split into tables of at most so many columns after the first, which each repeats."""
-        columns = range(1, len(self.headings))
-        for start in range(1, max(len(self.headings), 2), most):
-            chosen = [c for c in columns if start <= c < start + most]
-            yield Table(
-                caption=self.caption if start == 1 else f"{self.caption} (continued)",
-                headings=(self.headings[0], *(self.headings[c] for c in chosen)),
-                rows=tuple(
-                    row if len(row) == 1 else (row[0], *(row[c] for c in chosen))
-                    for row in self.rows
-                ),
-                words=tuple(i + 1 for i, c in enumerate(chosen) if c in self.words),
-            )
+        count = len(self.headings)
+        for start in range(1, max(count, 2), most):
+            part = self.picked(range(start, min(start + most, count)))
+            yield part if start == 1 else replace(part, caption=f"{self.caption} (continued)")
+
+    def picked(self, columns: Sequence[int]) -> Table:
+        """Return the table with the first column and some others."""
+        return replace(
+            self,
+            headings=(self.headings[0], *(self.headings[c] for c in columns)),
+            rows=tuple(
+                row if len(row) == 1 else (row[0], *(row[c] for c in columns)) for row in self.rows
+            ),
+            words=tuple(i + 1 for i, c in enumerate(columns) if c in self.words),
+        )
 
 
 def aligned(rows: Iterable[Sequence[str]], widths: Sequence[int], table: Table) -> list[list[str]]:
@@ -70,14 +74,19 @@ def text_lines(table: Table, room: int, *, rule: str = "─") -> list[str]:
     parts = [table]
     for most in range(max(len(table.headings) - 1, 1), 0, -1):
         parts = list(table.by_columns(most))
-        if all(sum(_widths(part)[1]) + _frame(part) <= room for part in parts):
+        if all(least_width(part) <= room for part in parts):
             break
     return [line for part in parts for line in _part_lines(part, room, rule)]
 
 
+def least_width(table: Table) -> int:
+    """Width of a table in which no name and no number is broken."""
+    return sum(_widths(table)[1]) + _frame(table)
+
+
 def _frame(table: Table) -> int:
     """Width of what stands around and between the columns."""
-    return 3 * len(table.headings) + 1
+    return table.gap * len(table.headings) + 1
 
 
 def _widths(table: Table) -> tuple[list[int], list[int]]:
@@ -86,22 +95,28 @@ def _widths(table: Table) -> tuple[list[int], list[int]]:
         [heading, *(row[i].text for row in table.cells() if i < len(row) > 1)]
         for i, heading in enumerate(table.headings)
     ]
-    words = [max(map(len, " ".join(column).split()), default=0) for column in columns]
-    return [max(map(len, c)) for c in columns], [min(word, _LONGEST_NUMBER) for word in words]
+    names = [" ".join(columns[0]), *(heading for heading, *_ in columns[1:])]
+    least = [
+        max([0, *map(len, name.split()), *(min(len(word), _LONGEST_NUMBER) for word in words)])
+        for name, words in zip(names, (" ".join(column).split() for column in columns), strict=True)
+    ]
+    return [max(map(len, c)) for c in columns], least
 
 
 def _part_lines(table: Table, room: int, rule: str) -> list[str]:
-    """Set a table; the widest words are broken before any number is."""
+    """Set a table; the widest headings are broken first, then words, and numbers last."""
     widths, least = _widths(table)
+    bodies, _ = _widths(replace(table, headings=("",) * len(widths)))
     while sum(widths) > room - _frame(table) and max(widths) > 1:
-        broken = [i for i, width in enumerate(widths) if width > least[i]] or range(len(widths))
+        wide = [i for i, width in enumerate(widths) if width > least[i]]
+        broken = [i for i in wide if widths[i] > bodies[i]] or wide or range(len(widths))
         widths[max(broken, key=widths.__getitem__)] -= 1
     lines = []
     for row in (table.headings, *(tuple(cell.text for cell in row) for row in table.cells())):
         whole = row if len(row) == len(widths) else (*row, *[""] * (len(widths) - len(row)))
         cells = [wrap(text, max(width, 1)) for text, width in zip(whole, widths, strict=True)]
         pieces = aligned(zip_longest(*cells, fillvalue=""), widths, table)
-        lines += [f"  {'   '.join(piece)}".rstrip() for piece in pieces]
+        lines += [f"  {(table.gap * ' ').join(piece)}".rstrip() for piece in pieces]
         if len(lines) == len(pieces):
             lines.append(f" {rule * (sum(widths) + _frame(table) - 2)}")
     return [*wrap(table.caption, room), "", *lines, ""]

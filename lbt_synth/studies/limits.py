@@ -244,13 +244,3 @@ def _warnings(
                 f"{name} leaves less in the truth, where each vibration is at one frequency; "
                 "this design is for all frequencies of its bands"
             )
-
-
-def say_residual(name: str, row: Facts, limit: ResidualLimit | None) -> str:
-    """Return the sentence on what a stable design leaves in the truth."""
-    said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
-    said += f"{100 * row.strehl:.1f} %)"
-    if limit is None or np.isnan(row.above_limit_percent):
-        return f"{said}."
-    least = nm_text(limit.rms_nm, ".1f")
-    return f"{said}, {row.above_limit_percent:z.0f} % above the {least} of the best linear one."

@@ -7,7 +7,7 @@ mean variance. Each night counts in units of what its own design leaves: the mea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -29,10 +29,9 @@ from lbt_synth.loop import residual_budget
 from lbt_synth.methods.method import DesignInputs
 from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import design_request
-from lbt_synth.models import TipTiltPlant, Vibration
-from lbt_synth.models.plant.assembly import PlantParts
-from lbt_synth.models.plant.tip_tilt import assemble
+from lbt_synth.models.plant.tip_tilt import mean_plant
 from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, choice
 
 ALL = "all nights"  # the design for all of them
@@ -71,7 +70,7 @@ class NightsDesign:
         """What the design of one night alone costs at worst, and what that for all nights does."""
         alone = sorted(self.nights, key=self.worst)
         stable = [night for night in alone if self.worst(night)[0] < np.inf]
-        told = dict.fromkeys([n for n in alone if n not in stable] + stable[-1:] + stable[:1])
+        told = dict.fromkeys([n for n in alone if n not in stable][:2] + stable[-1:] + stable[:1])
         words = "; ".join(f"that of {night} {self._say(night)}" for night in told)
         first = f"The design of one night alone, on its worst night: {words}."
         if ALL not in self.residual_nm:
@@ -162,6 +161,9 @@ def design_from_nights(
             raise
     designs = {night: recorded.design for night, recorded in made.items()}
     residual_nm = {night: _residuals_nm(design, made) for night, design in designs.items()}
+    for night, design in designs.items():
+        if np.isfinite([*residual_nm[night].values()]).all():
+            designs[night] = _assume_all_nights(night, design, made)
     notes = [
         f"{'warning: ' * note.startswith('warning: ')}{night}: {note.removeprefix('warning: ')}"
         for night, recorded in made.items()
@@ -200,6 +202,23 @@ def design_from_nights(
     return best
 
 
+def _assume_all_nights(night: str, design: Design, nights: Mapping[str, RecordedDesign]) -> Design:
+    """Return the design of a night with the sensor gains of all nights, at which it is stable."""
+    gains = np.concatenate([recorded.gains for recorded in nights.values()])
+    if not np.ptp(gains):  # it is known
+        return design
+    intervals = (dict.fromkeys(f"{end:.3g}" for end in ends) for ends in gains)
+    texts = listing_text([*dict.fromkeys(map(" to ".join, intervals))])
+    return replace(
+        design,
+        assumptions=(
+            f"the sensor gain is one that a night allows: {texts}; the loop is stable at all of "
+            "these",
+            *(f"{night}: {assumption}" for assumption in design.assumptions),
+        ),
+    )
+
+
 def _residuals_nm(design: Design, nights: Mapping[str, RecordedDesign]) -> dict[str, float]:
     """Return what a design leaves by the model of each night, nan where it is unstable."""
     residual_nm = dict.fromkeys(nights, np.nan)
@@ -208,53 +227,6 @@ def _residuals_nm(design: Design, nights: Mapping[str, RecordedDesign]) -> dict[
         if loop.is_stable and unstable_gains(design, night.gains) is None:
             residual_nm[name] = float(residual_budget(loop, night.model.plant()).rms_nm)
     return residual_nm
-
-
-def mean_plant(plants: Sequence[TipTiltPlant], weights: Sequence[float]) -> TipTiltPlant:
-    """Return the plant whose spectra are the weighted means of those of plants of one loop.
-
-    Lines that overlap become one of their power, and the turbulence has the shape of that plant
-    whose driving noise weighs most. The sensor gain is the geometric mean.
-    """
-    shares, hardware = np.array(weights) / np.sum(weights), plants[0].hardware
-    gains = np.array([np.diag(plant.hardware.sensor) for plant in plants])
-    gain = np.exp(np.mean(np.log(gains), axis=0))
-    noises = [p.R * np.outer(gain / own, gain / own) for p, own in zip(plants, gains, strict=True)]
-    air = []
-    for models in zip(*(plant.turbulence for plant in plants), strict=True):
-        powers = shares * [model.driving_rms_nm**2 for model in models]
-        strongest = models[int(np.argmax(powers))]
-        air.append(replace(strongest, driving_rms_nm=float(np.sqrt(np.sum(powers)))))
-    lines = [
-        replace(line, rms_nm=float(np.sqrt(share)) * line.rms_nm)
-        for share, plant in zip(shares, plants, strict=True)
-        for line in plant.vibrations
-    ]
-    return assemble(
-        PlantParts(
-            hardware=replace(hardware, sensor_matrix=np.diag(gain)),
-            turbulence=tuple(air),
-            vibrations=tuple(_merge(lines)),
-            noise_factor=np.linalg.cholesky(np.tensordot(shares, noises, 1)),
-        )
-    )
-
-
-def _merge(lines: Sequence[Vibration]) -> list[Vibration]:
-    """Return lines, with one for those of a direction that are nearer than their half widths."""
-    merged = list[Vibration]()
-    for line in sorted(lines, key=lambda one: (one.direction, one.sections, one.frequency_hz)):
-        last = merged[-1] if merged else line
-        half_hz, wider_hz = sorted(one.damping * one.frequency_hz for one in (last, line))
-        same = (last.direction, last.sections) == (line.direction, line.sections)
-        is_near = line.frequency_hz - last.frequency_hz < half_hz and wider_hz < 2 * half_hz
-        if merged and same and is_near:
-            weak, strong = sorted((merged.pop(), line), key=lambda one: one.rms_nm)
-            rms_nm = float(np.hypot(weak.rms_nm, strong.rms_nm))
-            move_hz = (weak.rms_nm / rms_nm) ** 2 * (weak.frequency_hz - strong.frequency_hz)
-            line = replace(strong, frequency_hz=strong.frequency_hz + move_hz, rms_nm=rms_nm)
-        merged.append(line)
-    return merged
 
 
 def require_one_loop(nights: Mapping[str, LoopRecord]) -> None:

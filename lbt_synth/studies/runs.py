@@ -107,7 +107,9 @@ def _run_row(
     command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
     return facts(
         design=fact(name, "design"),
-        residual_simulated_nm=fact(float(np.sqrt(np.mean(rms_nm**2))), "residual", **NM),
+        residual_simulated_nm=fact(
+            float(np.sqrt(np.mean(rms_nm**2))), "residual", **NM, missing="unstable"
+        ),
         residual_exact_nm=fact(residual_nm, "exact", **NM),
         strehl_simulated=fact(float(np.mean(strehls)), "Strehl", **PERCENT),
         strehl_exact=fact(exact_ratio, "exact", **PERCENT),

@@ -142,6 +142,7 @@ def test_an_output_that_is_an_input_is_refused(tmp_path, capsys, monkeypatch, or
     assert (tmp_path / taken).samefile(source)
 
 
+POINT_ENDS = r"\n\n|\n(?:note|warning|written): "  # of what a command says first
 SCREEN = {  # words and what a command says of its point, in the unit of the configuration
     "design lbt.yaml --method kalman -o k.fits": r"The Kalman filter leaves 5.12 mas rms",
     "design lbt.yaml --method hinf -o h.fits": r"(\d+) of \1 checks passed",
@@ -149,7 +150,7 @@ SCREEN = {  # words and what a command says of its point, in the unit of the con
     "show k.fits": r"35 % above the 3.79 mas of the best linear one",
     "verify h.fits": r"h.fits: verified. (\d+) of \1 checks passed",
     "compare lbt.yaml k.fits h.fits i.fits": r"k has the largest margin",
-    "plot sigma k.fits h.fits i.fits -o s.png": r"k survives 0.47 frames more delay",
+    "plot sigma k.fits h.fits i.fits -o s.png": r"k, with the largest margin, survives 0.47 frames",
     "plot step k.fits h.fits": r"settling time, to 5 %",
     "limits lbt.yaml k.fits": r"worst residual below \S+ mas rms",
     "robustness lbt.yaml k.fits h.fits": r"h keeps the highest Strehl ratio at worst over",
@@ -161,14 +162,26 @@ SCREEN = {  # words and what a command says of its point, in the unit of the con
     "telemetry night.fits": r"A loop of 2 modes at 800 Hz, for 4.125 s",
     "identify night.fits -o m.yaml --no-figure": r"1 vibration, the strongest of .* at 20.* Hz",
     "auto night.fits -o a.fits --no-figure": r"on unseen data, where what ran left [\d.]+ mas",
-    "diagnose night.fits k.fits": r"The record is sound",
+    "diagnose night.fits k.fits": r"The record is sound.*; k would leave .* k [\d.]+ [\d.]+",
     "export k.fits --for c -o c.c": r"What c computes differs from the controller by \S+ of",
     "rehearse night.fits k.fits --for c": r"On \d+ frames of night.fits: .* rms \(what ran\)",
     "report lbt.yaml k.fits h.fits -o r.html": r"^k leaves 5.12 mas rms .* written: r.html",
     "study study.yaml -o study": r"note: 64 of 64 samples computed in",
+    "study study.yaml -o study --row 3": r"Row 3, computed again, gives what is stored",
+    "init --examples -o d": r"Next, lbt-synth design d/lbt.yaml .* makes a controller",
     "init --telescope vlt": r"Next, put in your own numbers; then lbt-synth design vlt.yaml",
     "simulate sensors.yaml sensors.fits --drop m1@1s --frames 1500": r"sensors leaves \S+ nm rms",
 }
+
+
+def verdict_on_screen(text):
+    """Return the verdict of at most three sentences above one table, on a screen."""
+    lengths, verdict = [len(line) for line in text.splitlines()], re.split(POINT_ENDS, text)[0]
+    tables = len(re.findall("(?m)^ ─+$", text))
+    fits = len(lengths) <= 25, max(lengths) <= 100, tables <= 1
+    assert (fits, verdict.startswith(" ")) == ((True, True, True), False), text
+    assert 1 <= len(re.findall(r"\.(?=\s|$)", verdict)) <= 3, verdict
+    return " ".join(verdict.split())
 
 
 def test_a_command_fits_on_a_screen(tmp_path, capsys, monkeypatch, sensors_config, sensors_file):
@@ -181,16 +194,39 @@ def test_a_command_fits_on_a_screen(tmp_path, capsys, monkeypatch, sensors_confi
         Path(path.name).write_bytes(re.sub(rb"(?m)^samples: .*$", b"samples: 64", text))
     for words, point in SCREEN.items():
         text = run_done(capsys, *words.split())
-        lengths = [len(line) for line in text.splitlines()]
-        assert (len(lengths) <= 25, max(lengths) <= 100) == (True, True), words
-        verdict = re.split(r"\n\n|\n(?:note|warning|written): ", text)[0]
-        assert re.fullmatch(r"\S.*\.", verdict.strip(), re.DOTALL), words
+        assert verdict_on_screen(text).endswith("."), words
         assert re.search(point, " ".join(text.split())), (words, text)
         if not re.search(r"modal|study|sensors", words):
             assert re.findall(r".*\bnm\b.*", text) == [], words
     elsewhere = {"explore", "end-to-end", "paper"}  # one runs until it is ended, one needs an extra
     assert {words.split()[0] for words in SCREEN} | elsewhere == set(COMMANDS)
     assert {case.split()[0] for case in CASES} | READ_ONLY | WITHOUT_INPUTS == set(COMMANDS)
+
+
+MANY = {  # commands with fifteen gain files of long names, what they say, and how many rows
+    "compare {} -o c.csv": (r"^(\S+14) leaves 51.0 .* \1 has the largest margin, and", 12),
+    "plot nyquist {}": (r"^\S+14, with the largest margin, survives .* \S+_13, with the least", 9),
+    "robustness {} --delay-errors -1 0 1 --errors-hz -1 1 3 --sensor-gains 0.5 1 3": (
+        r"^\S+_00, \S+_01 and 13 others are unstable at up to \d of 9 pairs of a sensor gain and",
+        12,
+    ),
+    "simulate {} --frames 500 --cases 1": (r"\S+_14 leaves the least, .* \S+ leaves the most", 12),
+    "simulate {} --frames 500 --cases 1 --sensor-gain 1.8": (r"^\S+, \S+ and 12 others are u", 12),
+}
+
+
+def test_many_gain_files_fit_on_a_screen(tmp_path, capsys, monkeypatch, gains):
+    """The rows that the verdict names are shown, and no row is in two parts."""
+    monkeypatch.chdir(tmp_path)
+    names = [f"a_long_name_of_a_design_file_{i:02}.fits" for i in range(15)]
+    for name in names:
+        shutil.copy(gains["kalman" if name == names[-1] else "hinf"], name)
+    for words, (point, count) in MANY.items():
+        config = [] if words.startswith("plot") else [str(LBT_YAML)]
+        text = run_done(capsys, *words.format(" ".join([*config, *names])).split())
+        verdict, rows = verdict_on_screen(text), re.findall(r"(?m)^  (a_\S+)", text)
+        assert (re.search(point, verdict) is not None, len(rows) >= count) == (True, True), text
+        assert not words.startswith(("compare", "plot")) or rows[-1].endswith("file_14"), text
 
 
 def test_what_is_printed_is_cut_to_a_screen(capsys):

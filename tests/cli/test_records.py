@@ -46,8 +46,10 @@ def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, recorded
 
 def test_a_spectrum(tmp_path, capsys):
     f = np.arange(1, 1600) * 0.25
-    line = lbt.Vibration(frequency_hz=52, damping=0.02, rms_nm=30).ar_model(RATE)
-    density = (line.psd(f) + 0.5) * np.random.default_rng(0).gamma(20.0, 1 / 20.0, f.size)
+    facts = ((2.7, 0.1, 100), (52, 0.02, 30))  # Hz, damping ratio, nm
+    slow, line = (lbt.Vibration(frequency_hz=a, damping=b, rms_nm=c) for a, b, c in facts)
+    smooth = slow.ar_model(RATE).psd(f) + line.ar_model(RATE).psd(f) + 0.5
+    density = smooth * np.random.default_rng(0).gamma(20.0, 1 / 20.0, f.size)
     file, model = tmp_path / "psd.csv", tmp_path / "m.yaml"
     header = {"comments": "", "header": "frequency_hz,psd_nm2/Hz"}
     np.savetxt(file, np.column_stack([f, density]), delimiter=",", **header)
@@ -55,9 +57,11 @@ def test_a_spectrum(tmp_path, capsys):
     run_done(capsys, "identify", file, *facts, "-o", model)
     config = lbt.load_config(model)
     (line,) = config.plant.vibrations
-    facts = config.hardware.frame_rate_hz, line.frequency_hz
-    assert facts == (1000, pytest.approx(52, abs=0.3))
+    assert config.hardware.frame_rate_hz == 1000
+    assert line.frequency_hz == pytest.approx(52, abs=0.3)
     assert np.diag(config.plant.R) == pytest.approx(49)
+    text = run_done(capsys, "identify", file, *facts, "-o", model, "--lowest-line-hz", 60)
+    assert text.startswith("No vibration stands out")  # it is a part of the turbulence
 
 
 def test_accelerometers_are_compared_with_the_lines_of_the_model(tmp_path, capsys, tip_night):
@@ -130,6 +134,13 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night):
     assert out.with_suffix(".png").is_file()
     out.unlink()  # the model may be another's now
     assert "tt.yaml would be replaced" in run(capsys, "auto", recorded_night, "-o", out)[2]
+
+
+def test_auto_separates_axes_and_says_what_that_costs(tmp_path, capsys, recorded_night):
+    words = ("--separate-axes", "--method", "kalman", "--no-figure", "-o", tmp_path / "k.fits")
+    *_, row = run_json(capsys, "auto", recorded_night, *words)["held_out"]
+    assert row["name"] == "Kalman filter, axes mixed"
+    assert row["data_nm"] > 0
 
 
 def test_an_open_loop_series_and_one_axis(tmp_path, capsys):

@@ -138,6 +138,7 @@ def test_other_texts_are_refused(tmp_path):
         assert ("\n" in message, len(message) < 300) == (False, True)
     file.unlink()
     refused(lambda: lbt.load_config(file), ConfigError, "cannot read .*No such file")
+    refused(lambda: lbt.load_config(None), ProblemError, "path of a file; got NoneType")
 
 
 def test_templates_and_examples_come_with_the_package(tmp_path):

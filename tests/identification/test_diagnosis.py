@@ -13,7 +13,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import diagnose, loop_record
 from lbt_synth.identification.diagnosis import disturbance_lines, given_controller, line_name
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, LIMIT, RAN, compare_designs
-from lbt_synth.identification.records.record import split_halves
+from lbt_synth.identification.records.record import keep_frames, split_halves
 
 LOOP = {"frame_rate_hz": RATE, "delay_frames": 2, "unit": "nm"}
 
@@ -69,6 +69,10 @@ def test_a_short_record_has_channels_and_a_law():
         f"The commands are not those that the mirror followed: {turned.doubt}.",
         "First read the record with --command-sign -1.",
     )
+    few = replace(right, commands=replace(right.commands, law=None))
+    assert few.verdict[0].endswith("no fault, and so few frames do not tell which law ran.")
+    lost = keep_frames(right.record, np.zeros(right.record.frames, dtype=bool))
+    assert "100 % of the frames are lost" in replace(right, record=lost).verdict[0]
     # a fault of a channel may be what is wrong with them
     channel = replace(turned.channels[0], state="noisy")
     state, _, advice = replace(turned, channels=(channel,)).verdict

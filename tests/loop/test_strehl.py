@@ -117,6 +117,6 @@ def test_wrong_input_is_refused(config):
     calls += [partial(series_strehl, wrong, CAMERA) for wrong in series]
     calls += [partial(lbt.Imaging, diameter_m=d, other_modes=m) for d, m in ((8, 1.2), (0, 1))]
     rows = [(call, ProblemError, ".") for call in calls]
-    rows += [(partial(jitter, 50.0), ProblemError, r"got a number. Try \[\[rms_nm")]
+    rows += [(partial(jitter, 50.0), ProblemError, r"got float. Try \[\[rms_nm")]
     rows += [(partial(lbt.strehl, [[1.0]], config), ProblemError, "imaging must .* config.imaging")]
     require_refusals(rows)

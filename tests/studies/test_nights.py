@@ -13,8 +13,9 @@ import lbt_synth as lbt
 from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification import LoopRecord
 from lbt_synth.models import TipTiltPlant, Vibration
+from lbt_synth.models.plant.tip_tilt import mean_plant
 from lbt_synth.studies import design_from_nights, nights
-from lbt_synth.studies.nights import ALL, NightsDesign, mean_plant
+from lbt_synth.studies.nights import ALL, NightsDesign
 
 STILL = (58.0, 0.01, 25.0)  # a line that does not move: frequency [Hz], damping ratio, rms [nm]
 MOVING = (0.004, 60.0)  # damping ratio and rms [nm] of one that does
@@ -169,7 +170,7 @@ def test_the_verdict_of_a_design_of_one_night(of_all, words) -> None:
     pair = {name: made.nights[name] for name in "ab"}
     made = replace(made, nights=pair, designs=designs, residual_nm=residual_nm)
     assert made.name == "b"
-    assert made.design is made.nights["b"].design
+    assert made.design.plant is made.nights["b"].design.plant
     first, second = made.verdict
     assert "that of a is unstable on b; that of b leaves 2.25 times" in first
     assert words in second
@@ -186,7 +187,8 @@ def test_a_design_for_all_that_is_worse_gives_way_to_that_of_a_night(monkeypatch
     made = design_from_nights(records)
     best = min("ab", key=made.worst)
     assert made.name == best
-    assert made.design is made.nights[best].design
+    assert made.design.plant is made.nights[best].design.plant
+    assert "a night allows: 0.7 and 0.6; the loop" in made.design.assumptions[0]
     assert f"worse on every night than that of {best} alone, which is written." in made.verdict[1]
 
 

@@ -217,6 +217,16 @@ class Telemetry:
     imaging_wavelength_um: Positive | None = None
     metadata: Mapping[str, Scalar] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Return two lines: what was recorded, and how the loop ran."""
+        series = [layer.field for layer in LAYERS.values() if layer.axes.startswith("frame,")]
+        series = [name for name in series if getattr(self, name) is not None]
+        delay = "unknown" if self.delay_frames is None else f"{self.delay_frames:g} frames"
+        return (
+            f"<Telemetry: {self.frames} frames of {', '.join(series)},\n"
+            f" {count_text(self.modes, 'mode')} at {self.frame_rate_hz:g} Hz, delay {delay}>"
+        )
+
     def __post_init__(self) -> None:
         check_fields(self, metadata=_check_metadata(self.metadata))
         for name in ("command_unit", "measurement_unit"):

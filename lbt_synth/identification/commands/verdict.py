@@ -67,6 +67,7 @@ class CommandVerdict:
     gain: FloatArray  # (axes,), coarse sensor gain; nan where the coarse spectrum does not show it
     law: ControlLaw | None  # None where too few frames show it
     notes: tuple[str, ...] = ()  # what to look at although the record is accepted
+    read_with: str = ""  # options with which the record was read
 
     @property
     def accepted(self) -> bool:
@@ -83,10 +84,28 @@ class CommandVerdict:
         """What to do about it; empty if nothing is wrong."""
         if self.accepted:
             return ""
+        if self._wrong_options:
+            return f"leave {self._wrong_options} out"
         if self.repair.options:
-            return f"read the record with {self.repair.options}"
+            return f"read the record with {self._options}"
         advice = self.explanation.partition(". ")[2]
         return advice[:1].lower() + advice[1:] or _FIND
+
+    @property
+    def _options(self) -> str:
+        """The options that repair the record, with those that it was read with."""
+        return f"{self.read_with} {self.repair.options}".strip() if self.repair.options else ""
+
+    @property
+    def _wrong_options(self) -> str:
+        """The options with which the record was read, if one is wrong or another replaces it."""
+        asked, read_with = (
+            {word for word in options.split() if word.startswith("--")}
+            for options in (self.repair.options, self.read_with)
+        )
+        turns = {"--command-matrix"} if asked & {"--swap-axes", "--command-sign"} else set[str]()
+        wrong = {"--command-increments"} | turns | (asked or read_with)
+        return self.read_with if wrong & read_with else ""
 
     @property
     def overruled(self) -> tuple[str, ...]:
@@ -107,13 +126,16 @@ class CommandVerdict:
         if self.accepted:
             return
         law = "" if self.law is None else f" ({self.law.name} fits them{self.law.lag_text})"
-        options = self.repair.options
+        options = "" if self._wrong_options else self._options
+        try_first = f"Try {options}, or" if options else "Try"
+        if self._wrong_options:
+            try_first = f"Leave {self._wrong_options} out, or give"
         raise RecordError(
             f"the commands do not reach the measurements as given: {self.explanation}{law}.",
             explanation=self.explanation,
             options=options,
             in_python=f"Repair them as the options {options} do." if options else "",
-            at_terminal=f"Try {options}{', or ' * bool(options)}--accept-record to go on as it is.",
+            at_terminal=f"{try_first} --accept-record to go on as it is.",
         )
 
 
@@ -152,7 +174,8 @@ def _explain(
 ) -> CommandVerdict:
     """Explain the commands of axes that move, of which the record shows a law."""
     law = None if shown is None or shown.kind == "none" else shown
-    refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
+    unknown = np.full(record.axes, np.nan)
+    refuse = partial(CommandVerdict, gain=unknown, law=shown, read_with=record.read_with)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
         return refuse(explanation=doubt)
@@ -178,29 +201,40 @@ def _explain(
         return refuse(explanation=doubt)
     delay_frames = record.hardware.delay_frames
     off = repair.shift_frames and repair.shift_frames + lag
+    delays_off = _likely_delays(record, delay_frames + off, lag) if off else []
     repair = replace(
         repair,
         shift_frames=-lag if repair.shift_frames else 0,
-        delay_frames=delay_frames + off if off else None,
+        delay_frames=delays_off[0] if delays_off else None,
         scale=_factors(scale),
     )
     large = gain / scale >= limits[1]
     notes = _note_law(delay_frames, lag, delays, _unexplained(law), gain[large])
     return refuse(
-        explanation=_name_repair(repair, gain),
+        explanation=_name_repair(repair, gain, delays_off[1:]),
         repair=repair,
         gain=frozen_copy(np.where((gain / scale <= limits[0]) | large, np.nan, gain / scale)),
         notes=() if repair.options else notes,
     )
 
 
-def _name_repair(repair: CommandRepair, gain: FloatArray) -> str:
-    """Return what a repair undoes, with the sensor gains (axes,) that show its scale."""
+def _likely_delays(record: LoopRecord, delay_frames: float, lag: int) -> list[float]:
+    """Return the total delays near one that a fit of the model leaves open, the likeliest first."""
+    moved, near = CommandRepair(shift_frames=-lag), delay_frames + np.arange(-1.0, 1.5, 0.5)
+    costs = {d: _fit_cost(record.with_delay(d), moved) for d in near[near >= 1].tolist()}
+    likely = [d for d, value in costs.items() if value <= min(costs.values()) + _ODD]
+    return sorted(likely, key=costs.__getitem__)
+
+
+def _name_repair(repair: CommandRepair, gain: FloatArray, delays: Sequence[float] = ()) -> str:
+    """Return what a repair undoes, with the gains (axes,) of its scale and other likely delays."""
     if not repair.options:
         return AS_GIVEN
     gains = ", ".join(f"{value:.3g}" for value in gain)
     shown = f" (with them the sensor has a gain of {gains})" if repair.scale else ""
-    return " and ".join(repair.words()) + shown
+    others = " or ".join(f"{delay:g}" for delay in delays)
+    rival = [f"a delay of {others} frames explains the record as well"] if delays else []
+    return " and ".join([*repair.words(), *rival]) + shown
 
 
 def _doubt_repair(

@@ -286,7 +286,8 @@ def _identify_spectra(
     if np.any(densities <= 0):
         raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(densities):.6g}.")
     beyond = int(np.sum(record.frequency_hz >= rate / 2))
-    notes = [f"{beyond} frequencies beyond {rate / 2:g} Hz were left out"] if beyond else []
+    cut = f"{count_text(beyond, 'frequency', 'frequencies')} beyond {rate / 2:g} Hz"
+    notes = [f"{cut} {'was' if beyond == 1 else 'were'} left out"] if beyond else []
     axes, zero = [], np.zeros_like(f)
     for i, density in enumerate(densities):
         averages = record.averages or _estimate_averages(density)

@@ -37,6 +37,8 @@ _KINDS = (("measurements", "commands"), ("open_loop",), ("density", "frequency")
 CLOCKS = ("frame_numbers", "times")
 _ARRAY = re.compile(r".*\[(?=\d+\]$)")  # of which a name such as y[0] says that it is a column
 
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:e[-+]?\d+)?", re.IGNORECASE)
+
 Roles = dict[str, list[Column]]
 
 
@@ -209,13 +211,19 @@ def _read_text(out: Contents, content: bytes) -> None:
     lines = [line.strip("\r\n ") for line in content.decode("utf-8-sig").splitlines()]
     rows = [(n, line) for n, line in enumerate(lines, start=1) if line and line[0] != "#"]
     comments = [(n, line.lstrip("# ")) for n, line in enumerate(lines, start=1) if line[:1] == "#"]
-    for _, comment in comments:
-        _add_comment(out, comment)
+    for _, comment in comments:  # such as frame_rate_hz = 1000
+        sign = min((at for at in map(comment.find, ":=") if at > 0), default=0)
+        key, value = comment[:sign].strip(), comment[sign + 1 :].strip()
+        fact = recognise_fact(key) if value else None
+        if fact == "unit" and " " in value:
+            out.notes.append(f"the comment {key} was not taken for a unit: {value!r}")
+        elif fact is not None:
+            out.add_fact(fact, value, f"the comment {key}")
     if not rows:
         raise TelemetryError("it has no rows.")
-    sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
-    table = [[cell.strip(' "') for cell in line.split(sign)] for _, line in rows]
-    above = next((c.split(sign) for n, c in comments[::-1] if n < rows[0][0]), [])
+    delimiter = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
+    table = [[cell.strip(' "') for cell in line.split(delimiter)] for _, line in rows]
+    above = next((c.split(delimiter) for n, c in comments[::-1] if n < rows[0][0]), [])
     names = [""] * len(table[0])
     if _is_heading(table[0]):
         names = table.pop(0)
@@ -228,7 +236,18 @@ def _read_text(out: Contents, content: bytes) -> None:
         if len(cells) != len(names):
             raise TelemetryError(f"line {n} must have {len(names)} cells; got {len(cells)}.")
     values = np.array([[_parse_number(cell) for cell in cells] for cells in table])
-    out.columns += [parse_column(name, of) for name, of in zip(names, values.T, strict=True)]
+    for i, (name, of) in enumerate(zip(names, values.T, strict=True)):
+        column = parse_column(name, of)
+        missing = [(row[i], n) for row, (n, _), x in zip(table, rows, of, strict=True) if x != x]
+        wrong = [(cell, n) for cell, n in missing if cell.lower() not in ("", "nan")]
+        is_series = column.role in OF_AXES and 2 * len(wrong) > len(table)
+        if wrong and (is_series or _DECIMAL_COMMA.fullmatch(wrong[0][0])):
+            raise TelemetryError(
+                f"{len(wrong)} cells of {join_names([column])} are no numbers, the first "
+                f"{wrong[0][0]!r} in line {wrong[0][1]}. Write them with decimal points, and what "
+                "is missing as nan."
+            )
+        out.columns.append(column)
 
 
 def _is_heading(cells: Sequence[str]) -> bool:
@@ -240,17 +259,6 @@ def _parse_number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return float("nan")
-
-
-def _add_comment(out: Contents, comment: str) -> None:
-    """Add the fact of a comment such as frame_rate_hz = 1000."""
-    sign = min((at for at in map(comment.find, ":=") if at > 0), default=0)
-    key, value = comment[:sign].strip(), comment[sign + 1 :].strip()
-    if value and (fact := recognise_fact(key)) is not None:
-        if fact == "unit" and " " in value:
-            out.notes.append(f"the comment {key} was not taken for a unit: {value!r}")
-        else:
-            out.add_fact(fact, value, f"the comment {key}")
 
 
 _READERS: dict[str, Callable[[Contents, bytes], None]] = {

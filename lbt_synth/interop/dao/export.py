@@ -503,7 +503,7 @@ def _columns(design: Design, exact: FloatArray) -> tuple[float, _Matrix]:
             wide = np.stack([_widened(column, width) for column in exact.T], axis=1)
             columns = wide.astype(np.float32)
             best = min(best, (_loss(design, columns), columns), key=itemgetter(0))
-            if best[0] < LOSS / 4:
+            if best[0] < LOSS / 10:
                 break
     return best
 

@@ -342,6 +342,13 @@ class Replay:
     failures: tuple[Failure, ...]  # what failed now, the configuration among it
     files: tuple[Path, ...]  # that were written: the configuration, and the designs for this sample
 
+    @property
+    def changed(self) -> list[str]:
+        """Names of the stored results that are not what is computed now."""
+        now = [self.fresh.get(name, np.nan) for name in self.stored]
+        same = np.isclose([*self.stored.values()], now, equal_nan=True)
+        return [name for name, one in zip(self.stored, same, strict=True) if not one]
+
 
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
     """Compute one row of a study again, and write it as a configuration.

@@ -58,6 +58,8 @@ def test_telemetry_cannot_be_changed():
     series[0, 0], metadata["b"] = 5, 1
     assert (seen.commands[0, 0], dict(seen.metadata)) == (1, {"a": 3})
     assert type(seen.metadata["a"]) is int
+    assert repr(seen).startswith("<Telemetry: 6 frames of commands, measurements, ")
+    assert len(repr(seen).splitlines()) == 2
     for change, error in (
         (lambda: seen.commands.fill(2), ValueError),
         (lambda: seen.metadata.update(a=4), AttributeError),  # of a read-only view

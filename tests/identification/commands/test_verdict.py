@@ -23,6 +23,7 @@ from lbt_synth.identification.commands.control_law import (
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.commands.verdict import (
     AS_GIVEN,
+    CommandVerdict,
     explain_commands,
     judge_fitted_gains,
     likely_factors,
@@ -300,7 +301,29 @@ def test_a_fault_is_named_and_repaired(fault) -> None:
     assert error.options == verdict.repair.options
     assert verdict.explanation in verdict.overruled[0]
     if fault == "turned":
+        seen = replace(wrong, read_with="--command-sign -1")
+        assert explain_commands(seen).advice == "leave --command-sign -1 out"
         assert explain_commands(repair_commands(wrong, verdict.repair)).accepted
+
+
+@pytest.mark.parametrize(
+    ("read_with", "repair", "advice"),
+    [
+        ("--command-sign -1", CommandRepair(sign=(-1,)), "leave {} out"),
+        ("--command-matrix 0 1 1 0", CommandRepair(swap_axes=True), "leave {} out"),
+        ("--command-increments", CommandRepair(delay_frames=1.0), "leave {} out"),
+        ("--swap-axes", CommandRepair(), "leave {} out"),
+        ("--swap-axes", CommandRepair(sign=(-1,)), "read the record with {} --command-sign -1"),
+    ],
+)
+def test_the_advice_knows_the_options_that_were_given(read_with, repair, advice) -> None:
+    verdict = CommandVerdict(
+        explanation="wrong", repair=repair, gain=np.ones(2), law=None, read_with=read_with
+    )
+    assert verdict.advice == advice.format(read_with)
+    error = refused(verdict.require_accepted, lbt.errors.RecordError, "wrong")
+    assert read_with in error.at_terminal
+    assert ("Leave" in error.at_terminal) == ("leave" in advice)
 
 
 def test_records_that_are_accepted_with_a_note() -> None:
@@ -331,6 +354,9 @@ def test_a_wrong_delay() -> None:
     assert explain_commands(record.with_delay(2.5)).accepted  # 20 s hardly tell half a frame
     repair = explain_commands(record.with_delay(3.0)).repair
     assert (repair.options, repair.delay_frames) == ("--delay-frames 2", 2)
+    short = explain_commands(spliced_record((2,), lines=LINE, frames=10_000).with_delay(2.5))
+    assert short.repair == repair  # a whole frame that is not a whole frame from the delay given
+    assert short.explanation.endswith("and a delay of 1.5 frames explains the record as well")
 
 
 def test_commands_that_are_shaken_need_no_law() -> None:

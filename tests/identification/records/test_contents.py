@@ -32,6 +32,7 @@ def test_damage(tmp_path):
         ("a.csv", b"", "has no rows"),
         ("a.csv", b"y_nm,u_nm\n", "a heading and no rows"),
         ("a.csv", b"y_nm,u_nm\n1,2\n3\n", "line 3 must have 2 cells; got 1"),
+        ("a.csv", b"y;u\n1,5;2,5\n;1\n2;-1,5\n,5;0\n", "2 cells of y are no .* '1,5' in line 2"),
         ("a.csv", b"\xff\xfe\x00", "cannot read .*a.csv as .csv: 'utf-8' codec can't decode"),
         ("a.npy", b"\x93NUMPY garbage", "cannot read .*a.npy as .npy"),
         ("a.npz", b"PK", "it begins as neither an NPY file nor a ZIP archive does"),
