@@ -15,17 +15,17 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3204,
-    "config": 1620,
-    "design": 6034,
+    "config": 1611,
+    "design": 6007,
     "files": 1273,
-    "identification": 8969,
+    "identification": 8941,
     "interop": 3694,
-    "linear": 4760,
-    "loop": 3979,
+    "linear": 4697,
+    "loop": 3975,
     "methods": 802,
-    "models": 3810,
-    "report": 3531,
-    "storage": 1164,
+    "models": 3781,
+    "report": 3534,
+    "storage": 1163,
     "studies": 3171,
     "errors, validation": 564,
 }
@@ -33,9 +33,9 @@ COUNTS = {
     "files of the package": 205,
     "public names": 147,
     "tuned constants": 504,
-    "lines of tests": 24846,
+    "lines of tests": 24847,
     "lines of benchmarks": 3998,
-    "words of docs": 60166,
+    "words of docs": 60221,
 }
 
 

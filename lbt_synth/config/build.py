@@ -105,11 +105,8 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
         return _convert_mas_to_nm(settings, sensor.noise_mas, "sensor.noise_mas")
     if (pyramid := sensor.pyramid) is None:
         return sensor.noise_nm  # type: ignore[return-value]  # the schema wants one of the three
-    telescope = require_section(
-        settings,
-        "telescope",
-        "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm",
-    )
+    reason = "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm"
+    telescope = require_section(settings, "telescope", reason)
     numbers = dict(pyramid)
     across = numbers.pop("subapertures_across")
     return models.pyramid_tilt_noise_nm(
@@ -372,11 +369,8 @@ def build_truth(
     """Build the truth: turbulence, vibrations, noise and gain of the real loop."""
     kind, suite, motions = settings.true_turbulence, plant.hardware.suite, plant.motions
     if kind == "frozen_flow":
-        require_section(
-            settings,
-            "atmosphere",
-            "truth.turbulence: frozen_flow is its spectrum. Give it, or truth.turbulence: model",
-        )
+        hint = "truth.turbulence: frozen_flow is its spectrum. Give it, or truth.turbulence: model"
+        require_section(settings, "atmosphere", hint)
     one = plant.turbulence[0]
     same = all(model is one for model in plant.turbulence)
     spectra: dict[str, models.Spectrum | tuple[models.ARModel, ...] | None] = {
@@ -405,10 +399,7 @@ def build_end_to_end_setup(
     from lbt_synth.interop.specula.optics import EndToEndSetup  # half of the time of a design
 
     hint = "an end-to-end simulation needs it"
-    telescope, air = (
-        require_section(settings, "telescope", hint),
-        require_section(settings, "atmosphere", hint),
-    )
+    telescope, air = (require_section(settings, x, hint) for x in ("telescope", "atmosphere"))
     pyramid, modes = settings.sensor.pyramid, settings.mirror.modes
     calibrated = "must be left out for an end-to-end simulation, which calibrates it in nanometres"
     turbulence, screens = settings.true_turbulence, "must be a length: phase screens have an end"

@@ -44,17 +44,12 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.matrix_functions import relative_distance
-from lbt_synth.linear.riccati.filtering import (
-    FilterRiccati,
-    gamma_riccati,
-    kalman_riccati,
-    meets_level,
-)
+from lbt_synth.linear.riccati.filtering import GammaEquation, gamma_riccati, kalman_riccati
 from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.loop.budget import model_covariances
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import Column, Facts, fact, facts
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, set_fields
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, set_fields
 
 MOST_UNITS = 6  # sensors and channels of which every subset gets a filter
 ORIGIN = "distance from its Riccati filter"
@@ -69,7 +64,7 @@ def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
     with suppress(NumericalError):
         central = gamma_riccati(design.problem, gamma, start=evidence.kalman)
         origins += [] if central is None else [central]
-    distance = min(_distance(design, origin) for origin in origins)
+    distance = min(relative_distance(design.gain_predictor, x.gain_predictor) for x in origins)
     name = f"{ORIGIN}, or of the norm from its bound"
     value = min(distance, abs(norm / gamma - 1))
     yield Check(name, value, ORIGIN_TOLERANCE, "relative")
@@ -77,8 +72,9 @@ def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
 
 def _check_least(evidence: Evidence, least: float) -> Iterator[Check]:
     """Check the least norm on both sides: the level above is met, the level below is not."""
-    problem, sides = evidence.design.problem, (-TOLERANCE, TOLERANCE)
-    meets = [meets_level(problem, least * (1 + side), evidence.kalman) for side in sides]
+    equation = GammaEquation(evidence.design.problem, evidence.kalman)
+    levels = least * (1 - TOLERANCE), least * (1 + TOLERANCE)
+    meets = [equation.trial(level).P is not None for level in levels]
     off = 0.0 if meets == [False, True] else np.inf
     how = "gamma-Riccati equation on both sides"
     yield Check("least norm of any filter, error", off, TOLERANCE, how)
@@ -234,15 +230,10 @@ class FilterDesign(Design):
         if reads_several(self.problem):
             checks += fallback_checks(self.problem, self.fallbacks)
         if least:
-            distance = _distance(self, kalman)
+            distance = relative_distance(self.gain_predictor, kalman.gain_predictor)
             checks.append(Check(ORIGIN, distance, ORIGIN_TOLERANCE, "relative"))
         certificate = replace(certificate, checks=tuple(checks))
         return Evidence(design=self, certificate=certificate, kalman=kalman)
-
-
-def _distance(design: FilterDesign, origin: FilterRiccati) -> float:
-    """Return how far the gain of a filter is from that of a Riccati equation, relative."""
-    return relative_distance(design.gain_predictor, origin.gain_predictor)
 
 
 def filter_design(
@@ -285,14 +276,9 @@ def reads_several(problem: EstimationProblem) -> TypeGuard[TipTiltPlant]:
     return hardware is not None and bool(hardware.suite.sensors)
 
 
-def _remaining(plant: TipTiltPlant, missing: tuple[str, ...]) -> BoolArray:
-    """Return which measurements are left without some sensors, (q,)."""
-    return ~plant.hardware.suite.marked(missing, plant.hardware)
-
-
 def _fallback_gains(plant: TipTiltPlant, missing: tuple[str, ...]) -> FloatArray:
     """Return the Kalman gains without some sensors, zero for what is missing, (N, n, q)."""
-    remaining = _remaining(plant, missing)
+    remaining = ~plant.hardware.suite.marked(missing, plant.hardware)
     if not np.any(plant.read & remaining):
         shape = (plant.period, plant.n_states, plant.n_measurements)
         return frozen_copy(np.zeros(shape)[0 if plant.period == 1 else slice(None)])
@@ -326,7 +312,7 @@ def fallback_checks(problem: TipTiltPlant, fallbacks: Fallbacks) -> list[Check]:
 
 def _fallback_distance(plant: TipTiltPlant, missing: tuple[str, ...], gains: FloatArray) -> float:
     """Return how far the gains of a fall-back are from those of least variance, relative."""
-    remaining = _remaining(plant, missing)
+    remaining = ~plant.hardware.suite.marked(missing, plant.hardware)
     if not np.any(plant.read & remaining):
         return float(np.max(np.abs(gains), initial=0.0))
     error = plant.error_system(gains)

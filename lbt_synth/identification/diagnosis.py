@@ -259,9 +259,8 @@ def _costs(model: IdentifiedModel, controller: Controller | None) -> dict[str, f
         parts[line_name(line)] = parts.get(line_name(line), 0.0) + rms_nm**2
     total = float(np.trace(budget.total_nm2))
     parts["turbulence"] = total - sum(parts.values())  # slow resonances are turbulence
-    return {
-        name: float(np.sqrt(max(value, 0.0))) for name, value in (parts | {"all": total}).items()
-    }
+    parts["all"] = total
+    return {name: float(np.sqrt(max(variance, 0.0))) for name, variance in parts.items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -479,8 +478,7 @@ def _judge_loop(diagnosis: Diagnosis) -> Finding:
         return Finding(tone="note", sentence=f"The record shows no fault, and {law}.")
     gain = f"at the sensor gain of {loop.sensor_gain}"
     if loop.spectral_radius >= 1:
-        sentence = f"The record shows no fault, but {law}, which is UNSTABLE {gain}."
-        return Finding(sentence=sentence)
+        return Finding(sentence=f"The record shows no fault, but {law}, which is UNSTABLE {gain}.")
     stable = f", stable {gain}" if loop.stable_gains else ""
     narrow = bool(loop.modulus < _NARROW)
     if narrow:

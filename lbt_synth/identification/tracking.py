@@ -192,10 +192,8 @@ class TrackingController:
         if not close_loop(self._hardware, design.controller).is_stable:
             raise ProblemError("the loop must be stable with the new filter; it is not.")
         self._take(design)
-        measured, commands, _ = np.split(
-            np.array(self._past), [self._hardware.n_measurements, -1], 1
-        )
-        form = self._filter.controller
+        form, q = self._filter.controller, self._hardware.n_measurements
+        measured, commands, _ = np.split(np.array(self._past), [q, -1], axis=1)
         driven = measured @ form.B.T + commands @ form.applied.T
         self._filter.state = series_states(form.A, driven)[-1]
 

@@ -8,7 +8,7 @@ nominal one, a response also has a denominator ``1 - steering c``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import TypeAlias
 
 import numpy as np
@@ -87,18 +87,9 @@ def total_value(function: Function, c: FloatArray) -> float:
     return sum(part.value(c) for part in function)
 
 
-def is_convex(function: Function) -> bool:
-    """Whether no denominator depends on the coefficients."""
-    return all(part.steering is None for part in function)
-
-
-def without_denominators(function: Function) -> Function:
-    """Return the function with all denominators set to one: its value at the nominal gain."""
-    return tuple(replace(part, steering=None) for part in function)
-
-
-def merge_constraints(constraints: tuple[Constraint, ...]) -> tuple[Constraint, ...]:
+def merge_constraints(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
     """Concatenate the constraints of each kind, so that there are fewer, larger blocks."""
+    constraints = [constraint for group in groups for constraint in group]
     out: list[Constraint] = [c for c in constraints if isinstance(c, FunctionBound)]
     for kind in (Discs, HalfPlanes):
         parts = [c for c in constraints if isinstance(c, kind)]

@@ -168,11 +168,7 @@ def worst_invisible_disturbance(
 
 
 def _worst_burst(problem: EstimationProblem, P: FloatArray, gamma: float) -> Witness:
-    """Return the witness of a burst that ends where ``gamma^2 I - L P L'`` is least.
-
-    With the costate p, ``p(j) = (I + W P)^-1 A' p(j+1)``, ``x(j) = P p(j)``, ``w(j) = B' p(j+1)``
-    is the worst past that leads there.
-    """
+    """Return the witness of the worst past that ends where ``gamma^2 I - L P L'`` is least."""
     N, L, phases = problem.period, problem.L, as_stack(P)
     top = [np.linalg.eigh(L @ X @ L.T) for X in phases]
     last = int(np.argmax([values[-1] for values, _ in top]))

@@ -56,11 +56,7 @@ def _halve_panels(
     order: int,
     limits_of: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> RefinedPanels:
-    """Halve panels until the last changes (panels, ...) of their integrals are below limits.
-
-    The limits are a function of the sum of the sizes of all integrals, and of the lengths
-    (panels,).
-    """
+    """Halve panels until changes (panels, ...) are below limits by the total and the lengths."""
     low, high = edges[:-1], edges[1:]
     coarse = _panel_integrals(integrand, low, high, order)
     settled: list[tuple[FloatArray, FloatArray, FloatArray]] = []

@@ -427,11 +427,7 @@ def stacked_response(
 
 
 def _system_parts(system: Any) -> tuple[Any, Any, Any, Any, float]:
-    """Return A, B, C, D and the sampling period [s] of a discrete system; refuse anything else.
-
-    It takes a tuple (A, B, C, D), systems of python-control and of ``scipy.signal`` in any form,
-    and whatever else has these matrices and ``dt_s``. A period that is not given is 1.
-    """
+    """Return A, B, C, D and the period [s], 1 if none is given, of a discrete system."""
     if isinstance(system, tuple | list) and len(system) == 4:
         return (*system, 1.0)
     library = type(system).__module__.partition(".")[0]

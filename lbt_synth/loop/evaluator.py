@@ -90,7 +90,7 @@ class Evaluator:
 
         They enter by an entry (k or 1, n, w).
         """
-        weights, respond = self._holds.weights, self._pieces(entry)
+        weights, respond = (self.hold or STILL).weights, self._pieces(entry)
         along = np.moveaxis(entry @ transpose(entry), 0, -1)[:, :, None]
 
         def powers(f_hz: FloatArray) -> FloatArray:
@@ -102,7 +102,7 @@ class Evaluator:
                 squares = [w * _power(piece) for w, piece in zip(weights, pieces, strict=True)]
                 out[1] = np.sum(squares, axis=0) - of_mean
             if self.in_image:
-                rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ weights
+                rest = 1 - np.abs((self.hold or STILL).phase_means(f)) ** 2 @ weights
                 out[1] += along * rest[:, None]
             return out
 
@@ -164,7 +164,7 @@ class Evaluator:
 
     def of_noise(self, factor: FloatArray) -> FloatArray:
         """Return what white noise of covariance ``factor factor'`` leaves, (k or 1, q, p)."""
-        n, w = self.n_modes, self._holds.weights
+        n, w = self.n_modes, (self.hold or STILL).weights
         B, D = self.B[..., n:] @ factor, self.D[..., n:] @ factor
         covariance = replace(self, B=B, D=D).output_covariances()
         blocks = covariance.reshape(len(covariance), w.size, n, w.size, n)
@@ -182,7 +182,7 @@ class Evaluator:
         follow = (self._at(f) @ (share * entry)[..., None])[..., 0]
         pieces, along = follow.reshape(len(f), -1, n), entry[:, None, :n]
         rest = 1 - np.abs(share[:, 0]) ** 2
-        w = self._holds.weights
+        w = (self.hold or STILL).weights
         if self.hold is not None:  # with the phase that each has in its own hold
             means = self.hold.phase_means(f)
             rest = 1 - np.abs(means) ** 2 @ w
@@ -237,10 +237,6 @@ class Evaluator:
     @property
     def _matrices(self) -> Matrices:
         return self.A, self.B, self.C, self.D
-
-    @property
-    def _holds(self) -> Hold:
-        return STILL if self.hold is None else self.hold
 
     def _pieces(self, entry: FloatArray) -> Callable[[FloatArray], ComplexArray]:
         """Return what phases leave in each piece of a hold, (g, n, w, f, k), of frequencies."""

@@ -196,9 +196,8 @@ class Truth(Summarised):
             )
         return self.turbulence
 
-    is_of_means: ClassVar[bool] = (
-        False  # what the rms of a resonance is of: all moments, not means over frames
-    )
+    # what the rms of a resonance is of: all moments, not means over frames
+    is_of_means: ClassVar[bool] = False
 
     def entering(self, hardware: LoopHardware, *, sensor_gain: float) -> Entering:
         """Return what enters a loop that is closed with a sensor gain over the assumed one.

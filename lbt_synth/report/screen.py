@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.tables import Table, least_width
 from lbt_synth.storage.words import rank_names, unstable_text
 from lbt_synth.studies.limits import limits
-from lbt_synth.studies.robustness import RobustnessMap
+
+if TYPE_CHECKING:  # slow to import
+    from lbt_synth.studies.robustness import RobustnessMap
 
 _SHORTEST_NAME = 8  # letters that a name keeps which is shortened to make room
 

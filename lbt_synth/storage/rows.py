@@ -28,9 +28,8 @@ class Column:
     unit: str = ""  # of the numbers in tables
     format: str = ""  # of numbers, as ".1f"; by default six significant digits
     help: str = ""  # what the value is, without its unit and a full stop
-    scale: float = (
-        1.0  # from the value, which CSV and JSON hold, to that in tables: 100 for percent
-    )
+    # from the value, which CSV and JSON hold, to that in tables: 100 for percent
+    scale: float = 1.0
     missing: str = "-"  # the cell of nan or None
     key: str = ""  # the name in CSV and JSON; by default that of the field
     name: str = ""  # of the field

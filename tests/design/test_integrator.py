@@ -54,10 +54,10 @@ def test_the_best_gain_is_the_least_of_two_minima(sensor_gain):
 
 FLAT = [(None, [[1, 0, 1], [0, 1, 1]]), (None, [[1, 1], [1, 1]]), ([[1, 0.5]], None)]
 FLAT += [([[1 / 3, 2 / 3], [1 / 6, 1 / 3]], [[1, 0.1], [0.3, 7]])]
-TALL = [[0.1, -0.1], [0.6, 0.1], [-0.5, 0.4], [1.3, 0.9]], [[0.6, -1.3], [0.4, 1.1]]
+FLAT += [([[0.1, -0.1], [0.6, 0.1], [-0.5, 0.4], [1.3, 0.9]], [[0.6, -1.3], [0.4, 1.1]])]
 
 
-@pytest.mark.parametrize(("sensor", "influence"), [*FLAT, TALL])
+@pytest.mark.parametrize(("sensor", "influence"), FLAT)
 @pytest.mark.parametrize("law", [IntegratorLaw(), IntegratorLaw(integrators=2, zero_hz=5)])
 def test_what_is_seen_and_moved_has_the_usual_loop_and_the_rest_has_none(sensor, influence, law):
     path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=sensor, influence_matrix=influence)

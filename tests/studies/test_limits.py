@@ -10,7 +10,8 @@ import lbt_synth as lbt
 from lbt_synth.config import Config
 from lbt_synth.design.result import model_limits
 from lbt_synth.report.figures.studies import limits_figure
-from lbt_synth.studies.limits import compare_in_truth, limits, limits_at_rate, say_residual
+from lbt_synth.report.screen import say_residual
+from lbt_synth.studies.limits import compare_in_truth, limits, limits_at_rate
 
 
 def test_study(config, lbt_designs):

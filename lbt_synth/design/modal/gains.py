@@ -348,7 +348,11 @@ def _find_gains(
         spectra = _checked_spectra(density, nodes, differenced=differenced)
         variances = (spectra * weights) @ rejection.T
         variances += np.outer(noise_nm2, propagated)
-        _require_disturbances(variances[:, 0])
+        if np.any(variances[:, 0] == 0):
+            raise ProblemError(
+                "every mode must have turbulence, vibration or noise; got none in mode "
+                f"{int(np.argmin(variances[:, 0]))}."
+            )
         best, variance = _minimise(loop_gains, variances, limit, highest)
         if differenced:
             floor = noise_nm2 * np.interp(best, loop_gains, propagated)
@@ -374,15 +378,6 @@ def _find_gains(
         limited=read_only(gains > allowed * (1 - 1e-6)),
         noise_nm=noise_nm,
     )
-
-
-def _require_disturbances(variances: FloatArray) -> None:
-    """Refuse a mode (m,) that nothing disturbs."""
-    if np.any(variances == 0):
-        raise ProblemError(
-            "every mode must have turbulence, vibration or noise; got none in mode "
-            f"{int(np.argmin(variances))}."
-        )
 
 
 def _minimise(

@@ -14,14 +14,11 @@ from lbt_synth.design.shaping.terms import frequency_costs, noise_level
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import (
-    Constraint,
     Discs,
     Function,
     HalfPlanes,
-    is_convex,
     merge_constraints,
     total_value,
-    without_denominators,
 )
 from lbt_synth.validation import FloatArray
 
@@ -90,12 +87,12 @@ def solve_mode(
 
 def _minimise(programme: _Programme, start: FloatArray | None) -> tuple[FloatArray, list[float]]:
     """Return coefficients, and the objective over the grid after each programme."""
-    convex = is_convex(programme.function)
+    convex = all(part.steering is None for part in programme.function)
     # the steps need coefficients whose loops are stable at all sensor gains
     if not convex and start is not None and programme.is_stable(start):
         return _lower_objective(programme, start, [])
     while True:  # at unit gain, until all demands hold, or the loop is stable
-        c = programme.solve(without_denominators(programme.function))
+        c = programme.solve(tuple(replace(part, steering=None) for part in programme.function))
         if not programme.refine(c) or (not convex and programme.is_stable(c)):
             break
     values = [total_value(programme.function, c)]
@@ -132,7 +129,7 @@ class _Programme:
         self._excess = np.zeros(0)
         fine = replace(self.grid, points_hz=fine_frequencies(channel, _FINE * fineness))
         function, groups = specification.compile(channel, fine)
-        self._fine = function, _merge_groups(groups)
+        self._fine = function, merge_constraints(groups)
 
     def solve(self, function: Function, start: FloatArray | None = None) -> FloatArray:
         """Minimise a function under all demands; return the coefficients (n,)."""
@@ -147,7 +144,7 @@ class _Programme:
                 residual=float(self._excess.size),
             )
         self.solved += 1
-        held = _merge_groups(self.groups)
+        held = merge_constraints(self.groups)
         c, self.status = minimize(function, held, size=self.size, scale=self.scale, start=start)
         if c is None:
             raise _infeasibility_error(self)
@@ -188,11 +185,6 @@ class _Programme:
         ]
         peaks = [_local_peaks(f, use, 1 + ROOM / 2) for f, use in uses]
         return np.unique(np.concatenate([np.zeros(0), *peaks]))
-
-
-def _merge_groups(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
-    """Return the constraints of all demands, as few as possible."""
-    return merge_constraints(tuple(constraint for group in groups for constraint in group))
 
 
 def _local_peaks(frequency_hz: FloatArray, values: FloatArray, limit: float) -> FloatArray:

@@ -130,10 +130,7 @@ def accelerometer_transfers(
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
-    resonant = [
-        resonance.kind != "turbulence" and resonance.sections == 1 for resonance in model.parts
-    ]
-    places = np.flatnonzero(resonant).tolist()
+    places = [i for i, r in enumerate(model.parts) if r.kind != "turbulence" and r.sections == 1]
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
     lag, shift, error, transfers = 0, 0.0, float("inf"), tuple[TransferRow, ...]()

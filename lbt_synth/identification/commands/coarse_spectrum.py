@@ -102,9 +102,7 @@ def _segments(stretches: Sequence[tuple[int, int]], frame_rate_hz: float) -> Int
     longest = max(stop - start for start, stop in stretches)
     usual = max(SEGMENT_S * frame_rate_hz, _SHORTEST_SEGMENT)
     length = int(min(usual, max(longest // 2, _SHORTEST_SEGMENT), longest))
-    starts = [
-        start + i * length for start, stop in stretches for i in range((stop - start) // length)
-    ]
+    starts = [k for start, stop in stretches for k in range(start, stop - length + 1, length)]
     chosen = np.unique(np.linspace(0, len(starts) - 1, _MOST_SEGMENTS).astype(np.intp))
     return np.array(starts)[chosen][:, None] + np.arange(length)
 

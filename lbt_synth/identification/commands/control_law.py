@@ -191,9 +191,8 @@ def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:
     rest = rest - sum(series.y[rows - lag] @ law.taps[:, i].T for i, lag in enumerate(lags))
     rest = np.abs(rest - np.median(rest, axis=0))
     floor = np.sqrt(_EXACT) * np.median(np.abs(u[rows] - u[rows - 1]), axis=0)
-    beyond = np.any(
-        rest > np.maximum(2 * SURPRISING * MAD * np.median(rest, axis=0), floor), axis=1
-    )
+    limit = np.maximum(2 * SURPRISING * MAD * np.median(rest, axis=0), floor)
+    beyond = np.any(rest > limit, axis=1)
     odd = np.zeros(len(u), dtype=np.bool_)
     if np.mean(beyond) < FOLLOWED:
         odd[rows[beyond]] = True
@@ -276,9 +275,7 @@ class _Regression:
         """Return the part of what past commands leave that a law explains (axes,), unbiased."""
         out, used = np.zeros(self.axes), shape[0] + self.axes * len(shape[1])
         for axis in self.moving:
-            (_, before), (_, after) = (
-                self.solve(axis, one) for one in ((self.order, range(0)), shape)
-            )
+            before, after = (self.solve(axis, s)[1] for s in ((self.order, range(0)), shape))
             if before > 0:
                 ratio = after / before * (self.rows - self.order) / (self.rows - used)
                 out[axis] = max(0.0, 1 - ratio)

@@ -435,9 +435,8 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     """Return the largest modulus of the poles that depend on the sensor gain, infinite of none."""
     # a law that was found from series has poles and zeros that cancel, outside of the circle too
     weaker = replace(path, sensor_matrix=0.8 * path.sensor)
-    poles, others = (
-        np.linalg.eigvals(close_loop(loop, controller).system.A) for loop in (path, weaker)
-    )
+    loops = (close_loop(hardware, controller) for hardware in (path, weaker))
+    poles, others = (np.linalg.eigvals(loop.system.A) for loop in loops)
     moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
 

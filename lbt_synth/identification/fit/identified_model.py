@@ -163,9 +163,7 @@ class IdentifiedAxis(Summarised):
     @property
     def rms_nm(self) -> float:
         """Deviation of the whole disturbance [nm]."""
-        return float(
-            np.sqrt(self.turbulence.rms_nm**2 + sum(part.rms_nm**2 for part in self.parts))
-        )
+        return float(np.linalg.norm([self.turbulence.rms_nm, *(p.rms_nm for p in self.parts)]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -80,10 +80,8 @@ def find_shared(search: Search, models: Sequence[FittedModel]) -> FittedModel | 
 
     Turbulence comes first: that of both axes may look like weak parts of lines.
     """
-    parts = [
-        replace(c, axis=i) for i, model in enumerate(models) for c in model.spectrum.components
-    ]
-    named = tuple(replace(c, name=name) for name, c in enumerate(parts, start=1))
+    parts = [(i, c) for i, model in enumerate(models) for c in model.spectrum.components]
+    named = tuple(replace(c, axis=i, name=name) for name, (i, c) in enumerate(parts, start=1))
     apart = SpectrumModel(tuple(model.spectrum.background for model in models), named)
     pairs = _find_pairs(search, models, named)
     air = _share_turbulence(search, apart)

@@ -151,9 +151,8 @@ def _smear(
     sizes = [line[4].size for line in lines]
     widths = np.repeat([line[3] for line in lines], sizes)
     smeared = np.array(log_smearing(widths, np.concatenate([line[4] for line in lines])))
-    for (i, band, place, *_), rows in zip(
-        lines, np.split(smeared, np.cumsum(sizes)[:-1], axis=1), strict=True
-    ):
+    changes = np.split(smeared, np.cumsum(sizes)[:-1], axis=1)
+    for (i, band, place, *_), rows in zip(lines, changes, strict=True):
         density[i, band] *= np.exp(rows[0])
         if slopes is not None:
             slopes[i, 0, band] += rows[1] - rows[2] * place

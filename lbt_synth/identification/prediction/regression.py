@@ -71,9 +71,8 @@ class Moments:
 
     def chosen(self, places: IntArray) -> Moments:
         """Return the moments of some signals alone."""
-        return replace(
-            self, squares=self.squares[np.ix_(places, places)], products=self.products[places]
-        )
+        squares = self.squares[np.ix_(places, places)]
+        return replace(self, squares=squares, products=self.products[places])
 
     def left(self, coefficients: FloatArray) -> float:
         """Return the mean square that coefficients (taps m, n) leave of the targets, summed."""
@@ -304,8 +303,7 @@ def regress(
     scales = np.sqrt(np.mean(changes**2, axis=0))
     moments = [lagged_moments(signals, left, part, TAPS) for part in parts]
     if np.any(added_nm):
-        drawn = np.random.default_rng(1).standard_normal((count + first, path.modes))
-        drawn *= added_nm
+        drawn = added_nm * np.random.default_rng(1).standard_normal((count + first, path.modes))
         silence = np.zeros((len(drawn), beside.shape[1]))
         heard, left, _, target = lay(drawn, ((0, len(drawn)),), silence)
         for place, (a, b) in enumerate(pairwise(edges)):
@@ -353,11 +351,6 @@ def channel_values(
         without = past.solve(others, past.penalty, past.whole.chosen(past.places(others)))
         silent = coefficients.copy()
         silent[past.places([signal])] = 0.0
-        rows.append(
-            ChannelValue(
-                channel=name,
-                without_nm=left_nm(others, without),
-                dead_nm=left_nm(everything, silent),
-            )
-        )
+        without_nm, dead_nm = left_nm(others, without), left_nm(everything, silent)
+        rows.append(ChannelValue(channel=name, without_nm=without_nm, dead_nm=dead_nm))
     return tuple(rows)

@@ -134,10 +134,8 @@ class ResidualEstimate:
         powers = (welch(one.measured_nm, nperseg=_SEGMENT, axis=0)[1] for one in (self, other))
         more = np.subtract(*(np.sum(power, axis=1) for power in powers))
         peak, below = int(np.argmax(more)), np.flatnonzero(more < np.max(more) / 2)
-        low, high = (
-            max(below[below < peak], default=-1),
-            min(below[below > peak], default=len(more)),
-        )
+        low = max(below[below < peak], default=-1)
+        high = min(below[below > peak], default=len(more))
         return (low + 0.5) / _SEGMENT, (high - 0.5) / _SEGMENT
 
     def parts(self, count: int) -> list[ResidualEstimate]:
@@ -177,13 +175,12 @@ def estimate_residual(
     measured: FloatArray, stretches: Stretches, noise_nm2: FloatArray, noise_error_nm4: FloatArray
 ) -> ResidualEstimate:
     """Estimate a residual from the measured residual (frames, n) of some stretches."""
-    error = mean_covariance(measured, measured, stretches) + noise_error_nm4
     return ResidualEstimate(
         measured_nm=frozen_copy(measured),
         stretches=stretches,
         noise_nm2=frozen_copy(noise_nm2),
         covariance_nm2=frozen_copy(measured.T @ measured / len(measured) - noise_nm2),
-        error_nm4=frozen_copy(error),
+        error_nm4=frozen_copy(mean_covariance(measured, measured, stretches) + noise_error_nm4),
     )
 
 

@@ -186,13 +186,9 @@ def minimize_relaxation(
 def _state(
     programme: ConicProgramme, function: Function, origin: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
-    """State a convex model of a function of a step from an origin, over its scale.
-
-    It is ``linear x + |roots x|^2`` plus a constant, (x,) and (k, x), in all unknowns x: the step,
-    then a level for each part of which the largest counts: its square bounds all fractions.
-    """
+    """State a convex model ``linear x + |roots x|^2`` of a step from an origin, over its scale."""
     linear, roots, n = np.zeros(programme.size), [], origin.size
-    level = iter(np.eye(programme.size)[n:])
+    level = iter(np.eye(programme.size)[n:])  # of a part of which the largest fraction counts
     for fractions in function:
         if fractions.worst:
             values, slopes, _ = _expand(fractions, origin)
@@ -256,7 +252,11 @@ def _constrain(
         centres = constraint.centres / constraint.radii + turns @ origin
         _bound_norms(programme, centres[:, None], turns[:, None], more, 1.0)
     else:
-        root, target = _least_squares_form(constraint.function)
+        # sum |centres + rows c|^2 = ||root c - target||^2
+        slopes, centres = constraint.function.rows, constraint.function.centres
+        system = np.hstack([slopes.reshape(-1, origin.size), -centres.reshape(-1, 1)])
+        triangle = np.asarray(np.linalg.qr(np.vstack([system.real, system.imag]), mode="r"))
+        root, target = triangle[:, :-1], triangle[:, -1]
         unit = 1 / np.sqrt(constraint.limit)
         _bound_norms(programme, unit * (root @ origin - target)[None], unit * root[None], more, 1.0)
 
@@ -276,12 +276,3 @@ def _bound_norms(
     values = np.concatenate([centres.real, centres.imag], axis=1)
     offsets = np.pad(values, ((0, 0), (1, 0)), constant_values=offset).astype(np.float64)
     programme.add_second_order(inner.reshape(-1, slopes.size), offsets)
-
-
-def _least_squares_form(function: Fractions) -> tuple[FloatArray, FloatArray]:
-    """Root and target with ``sum |centres + rows c|^2 = ||root c - target||^2``."""
-    size = function.rows.shape[-1]
-    rows = function.rows.reshape(-1, size)
-    system = np.hstack([rows, -function.centres.reshape(-1, 1)])
-    triangle = np.asarray(np.linalg.qr(np.vstack([system.real, system.imag]), mode="r"))
-    return triangle[:, :size], triangle[:, size]

@@ -103,10 +103,7 @@ class InnovationProgramme:
 
 
 def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int], list[int]]]:
-    """Group outputs and innovations, (F, q, w) and (F, l, w), that share a disturbance.
-
-    The best filter has no taps between groups, such as axes that do not couple.
-    """
+    """Group outputs and innovations that share a disturbance: no tap between groups is of use."""
     stacked = np.concatenate([N, E], axis=1)
     size = np.linalg.norm(stacked, axis=(0, 2))
     products = np.abs(stacked @ stacked.conj().swapaxes(1, 2)).sum(axis=0)

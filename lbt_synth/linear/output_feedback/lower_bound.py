@@ -24,12 +24,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.infeasibility_proof import (
-    Witness,
-    priced_growth,
-    scaled_basis,
-    steady_oscillation,
-)
+from lbt_synth.linear.infeasibility_proof import Witness, priced_growth, scaled_basis
 from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.riccati.dare import solve_dare
@@ -124,10 +119,7 @@ def _moments(side: GeneralizedPlant, root: FloatArray, pairs: Witness) -> _Momen
 def _hide(
     side: GeneralizedPlant, states: FloatArray, signals: FloatArray
 ) -> tuple[FloatArray, _Moments | None]:
-    """Change signals as little as hides them from what the constraint reads.
-
-    Return the successors (n, r), and the moments without growth; None where they are not hidden.
-    """
+    """Hide signals by the least change; return successors (n, r), and moments if it hides them."""
     shown = side.B2.T @ states + side.D12.T @ signals
     signals = signals - np.linalg.pinv(side.D12.T, rcond=1e-10) @ shown
     seen, cancelled = side.B2.T @ states, side.D12.T @ signals
@@ -208,9 +200,3 @@ def coupled_bursts(
     root = semidefinite_root(X)
     meeting = root @ np.linalg.eigh(root.T @ Y @ root)[1][:, -1:]
     return _burst(estimation, Y, meeting), _burst(control, X, Y @ meeting)
-
-
-def steady_pairs(side: GeneralizedPlant, angle: float) -> Witness:
-    """Return the pairs of one frequency that gain most: no law changes them."""
-    S = side
-    return steady_oscillation((S.A.T, S.C1.T, S.B2.T, S.D12.T), (S.B1.T, S.D11.T), angle)

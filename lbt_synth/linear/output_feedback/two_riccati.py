@@ -26,7 +26,7 @@ from scipy.optimize import brentq
 
 from lbt_synth.errors import NonFiniteError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant, invert_well_posed
-from lbt_synth.linear.infeasibility_proof import slow_angles
+from lbt_synth.linear.infeasibility_proof import slow_angles, steady_oscillation
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two, semidefinite_root
 from lbt_synth.linear.norms import hinf_norm
 from lbt_synth.linear.output_feedback.lower_bound import (
@@ -34,7 +34,6 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     WorstCase,
     coupled_bursts,
     last_step,
-    steady_pairs,
 )
 from lbt_synth.linear.riccati.dare import require_seen, solve_dare
 from lbt_synth.linear.riccati.equations import Equations, solve_by_doubling, solve_by_schur
@@ -236,12 +235,14 @@ class TwoRiccati:
                 ("unseen", plant.transposed(), estimation, solution.Y, _ESTIMATION),
             )
             for pairs, side, worst, cost, (reason, reason_at) in cases:
+                shown = side.A.T, side.C1.T, side.B2.T, side.D12.T
+                gained = side.B1.T, side.D11.T
                 if plant is self.plant:
                     with suppress(NonFiniteError):  # of a worst case that rounding makes unstable
                         burst = {pairs: last_step(worst, cost)}
                         out.append(ControlWitness(**burst, reason=reason))
                 for angle in (*slow_angles(worst.A)[:4], 0.0, np.pi):
-                    steady = {pairs: steady_pairs(side, angle)}
+                    steady = {pairs: steady_oscillation(shown, gained, angle)}
                     text = f"{reason_at} {angle / (2 * np.pi * plant.dt_s):.6g} Hz"
                     out.append(ControlWitness(**steady, reason=text))
             if plant is self.plant:
@@ -468,9 +469,11 @@ def regularise(plant: GeneralizedPlant, share: float) -> GeneralizedPlant:
     """
     P, n = plant, len(plant.A)
     m1, m2, p1, p2 = P.sizes
-    K = _cancelling(P)
-    error = share * _size(P.C1 + P.D12 @ K @ P.C2, P.D12, P.D11 + P.D12 @ K @ P.D21)
-    push = share * _size(P.B1 + P.B2 @ K @ P.D21, P.D21, P.D11 + P.D12 @ K @ P.D21)
+    K = -np.linalg.pinv(P.D12, rcond=_PART) @ P.D11 @ np.linalg.pinv(P.D21, rcond=_PART)
+    cancelled, uncancelled = _sizes_under(P, K), _sizes_under(P, 0 * K)
+    cancels = cancelled[0] * cancelled[1] < uncancelled[0] * uncancelled[1]
+    K, sizes = (K, cancelled) if cancels else (0 * K, uncancelled)
+    error, push = (share * size for size in sizes)
     C1 = np.vstack([P.C1, -error * K @ P.C2, error * np.eye(n)])
     D12 = np.vstack([P.D12, error * np.eye(m2), np.zeros((n, m2))])
     B1 = np.hstack([P.B1, -push * P.B2 @ K, push * np.eye(n)])
@@ -481,15 +484,11 @@ def regularise(plant: GeneralizedPlant, share: float) -> GeneralizedPlant:
     return replace(P, B1=B1, C1=C1, D11=D11, D12=D12, D21=D21)
 
 
-def _cancelling(plant: GeneralizedPlant) -> FloatArray:
-    """Return the constant control (m2, p2) that leaves least of D11, if it makes nothing larger."""
-    P = plant
-    K = -np.linalg.pinv(P.D12, rcond=_PART) @ P.D11 @ np.linalg.pinv(P.D21, rcond=_PART)
+def _sizes_under(P: GeneralizedPlant, K: FloatArray) -> tuple[float, float]:
+    """Return the sizes of errors and disturbances under a constant control (m2, p2)."""
     through = P.D11 + P.D12 @ K @ P.D21
-    cancelled = _size(P.C1 + P.D12 @ K @ P.C2, P.D12, through)
-    cancelled *= _size(P.B1 + P.B2 @ K @ P.D21, P.D21, through)
-    uncancelled = _size(P.C1, P.D12, P.D11) * _size(P.B1, P.D21, P.D11)
-    return K if cancelled < uncancelled else 0 * K
+    errors = _size(P.C1 + P.D12 @ K @ P.C2, P.D12, through)
+    return errors, _size(P.B1 + P.B2 @ K @ P.D21, P.D21, through)
 
 
 def _size(*parts: FloatArray) -> float:

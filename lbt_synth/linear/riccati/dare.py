@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -186,7 +186,8 @@ def _try_routes(equations: Equations) -> tuple[Solutions, str, int]:
         unsolved = equations.take(poor)
         trial = _refined(unsolved, solve_by_schur(unsolved))
         better = trial.residuals < best.residuals[poor]
-        best.replace_rows(poor[better], trial, better)
+        for field in fields(best):
+            getattr(best, field.name)[poor[better]] = getattr(trial, field.name)[better]
         route = "schur" if better.any() else route
     return best, route, steps
 

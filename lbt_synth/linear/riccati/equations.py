@@ -5,7 +5,7 @@ X is not finite where a route failed. The caller refines and verifies it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
@@ -40,11 +40,6 @@ class Solutions:
     poles: ComplexArray
     residuals: FloatArray  # relative
     errors: FloatArray  # of X, estimated
-
-    def replace_rows(self, rows: IntArray, other: Solutions, chosen: BoolArray) -> None:
-        """Put the chosen answers of others in these rows."""
-        for field in fields(self):
-            getattr(self, field.name)[rows] = getattr(other, field.name)[chosen]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

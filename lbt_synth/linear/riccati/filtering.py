@@ -116,10 +116,7 @@ def _filter_of(P: FloatArray, gains: FloatArray, iterations: int, status: str) -
 
 
 def _settle_phases(problem: EstimationProblem, P: FloatArray) -> FloatArray:
-    """Return the covariances of all phases, (N, n, n).
-
-    After a sweep in Joseph's form, each Newton step takes the covariances that the gains leave.
-    """
+    """Return the covariances (N, n, n) of a sweep in Joseph's form and of Newton steps."""
     covariances = np.empty_like(problem.A)
     for t in range(problem.period):
         covariances[t] = P
@@ -291,15 +288,12 @@ class GammaEquation:
 
 
 def _central_gain(problem: EstimationProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:
-    """Return the gain of the predictor (n, q) of the central filter at a phase.
-
-    That of the filter is the first block column of ``P outputs' Re^-1``, with Re the indefinite
-    covariance of the innovations of y and of z / gamma: Pt itself may be unbounded.
-    """
+    """Return the predictor's gain (n, q) of the central filter at a phase."""
     _, _, C, D = problem.read_parts(t)
     A, _, injection = decorrelate(problem, t)
     outputs = np.vstack([C, problem.L / gamma])
     innovations = outputs @ P @ outputs.T + block_diag(D @ D.T, -np.eye(len(problem.L)))
+    # the first block column of P outputs' innovations^-1: Pt itself may be unbounded
     gain_filter = np.linalg.solve(innovations, outputs @ P)[: len(C)].T
     out = np.zeros((problem.n_states, problem.n_measurements))
     out[:, problem.read[t % problem.period]] = A @ gain_filter + injection
@@ -313,11 +307,6 @@ def gamma_riccati(
     start = kalman_riccati(problem) if start is None else start
     equation = GammaEquation(problem, start)
     return equation.solution(gamma, equation.trial(gamma))
-
-
-def meets_level(problem: EstimationProblem, gamma: float, start: FilterRiccati) -> bool:
-    """Return whether a filter meets a level of gamma; ``start`` is the Kalman filter's solution."""
-    return GammaEquation(problem, start).trial(gamma).P is not None
 
 
 def least_gamma(

@@ -161,7 +161,8 @@ def lifted_mirror(loop: PositionLoop, frame_rate_hz: float, delay_frames: float)
     while abs(core.D) <= _NOTHING:  # the mirror has not moved yet: one more frame of delay
         core = replace(core, C=core.C @ core.A, D=float(core.C @ core.B))
         lead += 1
-    units = _balancing_units(core)
+    scales = balancing_scales(core.A, np.abs(core.B), np.abs(core.C))
+    units = scales[:-1] / scales[-1]  # powers of two, in which the system is balanced
     core = Response(A=core.A * units / units[:, None], B=core.B / units, C=core.C * units, D=core.D)
     hold = Hold(
         start=delay_frames - 1,
@@ -253,10 +254,7 @@ def _one_frame(
 
 
 def _integrals(loop: PositionLoop, ways: FloatArray, ends: FloatArray) -> FloatArray:
-    """Integral of the position from the arrival of a command to some times [samples], (t, width).
-
-    ``ways`` (samples, n + 1, width) are states and command at the begin of each sample.
-    """
+    """Integral of the position to times [samples], (t, width), by ways (samples, n + 1, width)."""
     per_sample = loop.position_integral(1.0) @ ways
     before = np.vstack([np.zeros(ways.shape[2]), np.cumsum(per_sample, axis=0)])
     started = np.minimum(ends.astype(np.int64), len(ways) - 1)
@@ -298,10 +296,3 @@ def tapped_mirror(taps: FloatArray) -> Response:
     """System with an impulse response; its states are the past commands."""
     n = len(taps) - 1
     return Response(A=np.eye(n, k=-1), B=np.eye(n, 1)[:, 0], C=taps[1:], D=float(taps[0]))
-
-
-def _balancing_units(core: Response) -> FloatArray:
-    """Powers of two by which the states are scaled so that the system is balanced, (n,)."""
-    n = core.n_states
-    scaling = balancing_scales(core.A, np.abs(core.B), np.abs(core.C))
-    return np.asarray(scaling[:n] / scaling[n])

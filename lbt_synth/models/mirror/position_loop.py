@@ -240,10 +240,7 @@ class PositionLoop:
         return row
 
     def _motion(self, part: float) -> FloatArray:
-        """Position, velocity and integral of the position after a part of a sample, (3, n + 1).
-
-        The columns are the states at the beginning of the sample, and the command.
-        """
+        """Motion [x, x', integral of x] after a part of a sample, over states and command."""
         moved = _exponential(
             2 * np.pi * self.natural_frequency_hz / self.sampling_hz, self.damping, float(part)
         )

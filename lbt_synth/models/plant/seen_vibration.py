@@ -166,12 +166,9 @@ def _exposure(
 
 
 def _frame_map(line: Vibration, dt_s: float, parts: Sequence[float]) -> list[FloatArray]:
-    """Return the maps to the mean position, (1, 2 + 3 m), and to the m ends of parts, (2, 2 + 3 m).
-
-    They are from position and velocity over w0 at the begin of a frame, and white noise.
-    """
+    """Return maps (., 2 + 3 m) of state and noise to the mean position, and to m ends of parts."""
     angle, m = 2 * np.pi * line.frequency_hz * dt_s, len(parts)
-    ends, now = [], np.eye(3, 2 + 3 * m)  # position, velocity, integral of the position
+    ends, now = [], np.eye(3, 2 + 3 * m)  # position, velocity over w0, integral of the position
     now[2] = 0.0
     for i, (start, end) in enumerate(pairwise([0.0, *parts])):
         length = end - start
@@ -188,10 +185,7 @@ def _frame_map(line: Vibration, dt_s: float, parts: Sequence[float]) -> list[Flo
 
 
 def _sampled(angle: float, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Return transition and root of the noise of [x, x', integral of x] over a unit of time.
-
-    The oscillator has the angular frequency ``angle``, the force a unit density.
-    """
+    """Return transition and noise root of [x, x', integral of x] for a force of unit density."""
     rates = np.array([[0.0, 1.0, 0.0], [-(angle**2), -2 * damping * angle, 0.0], [1.0, 0.0, 0.0]])
     generator = np.zeros((6, 6))
     generator[:3, :3], generator[3:, 3:], generator[1, 4] = -rates, rates.T, 1.0

@@ -131,7 +131,7 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
         model = 1 + (rms / noise) ** 2 * np.exp(shape)
         return float(np.log(numerator) + weight @ (np.log(model) - shape + target / model))
 
-    starts = [_pack(f * crossing_hz, z) for f in _FREQUENCIES for z in _DAMPINGS]
+    starts = [np.log([f * crossing_hz, z / (1 - z)]) for f in _FREQUENCIES for z in _DAMPINGS]
     with np.errstate(all="ignore"):  # noise far above the turbulence leaves nothing to fit
         fit = minimize(
             contrast,
@@ -154,13 +154,8 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     )
 
 
-def _pack(frequency_hz: float, damping: float) -> FloatArray:
-    """Return log frequency and log damping / (1 - damping)."""
-    return np.log([frequency_hz, damping / (1 - damping)])
-
-
 def _unpack(p: FloatArray, rate: float) -> tuple[float, float]:
-    """Return the angle per frame and the damping of packed parameters."""
+    """Return angle per frame and damping, from log frequency and log damping / (1 - damping)."""
     return 2 * np.pi * float(np.exp(p[0])) / rate, float(1 / (1 + np.exp(-p[1])))
 
 

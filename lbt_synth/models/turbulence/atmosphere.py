@@ -153,7 +153,11 @@ class Atmosphere:
         spline_of = tilt_spline if len(ratios) <= _TERMS else _interpolated_spline
         for ratio in ratios:
             rows = unique.imag == ratio
-            values[rows] = _log_density(spline_of(float(ratio), self.obstruction), x[rows])
+            spline = spline_of(float(ratio), self.obstruction)
+            first, last = spline.x[[0, -1]]
+            # constant below the first knot, the power law f^(-17/3) of tilt beyond the last
+            beyond = np.maximum(x[rows] - last, 0)
+            values[rows] = spline(np.clip(x[rows], first, last)) - 17 / 3 * beyond
         factors = tilt_strength_nm2(self) * crossing_s
         density = np.exp(values)[which.reshape(-1)] * factors[:, None]
         return np.asarray(density.reshape((*np.shape(self.wind_speed_m_s), *frequency.shape)))
@@ -202,15 +206,6 @@ def tilt_variance(scale_ratio: float, obstruction: float) -> float:
     """Variance of one axis for a unit strength."""
     f, w = _spatial_panels()
     return float(np.sum(2 * np.pi * f * w * _filtered_spectrum(scale_ratio, obstruction, f)))
-
-
-def _log_density(spline: PPoly, x: FloatArray) -> FloatArray:
-    """Logarithms of a tilt spectrum at logarithms of frequencies.
-
-    It is constant below the first knot, and the power law f^(-17/3) of tilt beyond the last.
-    """
-    first, last = spline.x[[0, -1]]
-    return np.asarray(spline(np.clip(x, first, last)) - 17 / 3 * np.maximum(x - last, 0))
 
 
 @lru_cache(maxsize=128)
