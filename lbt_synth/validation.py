@@ -298,11 +298,10 @@ def text(value: Any, name: str) -> str:
     return value
 
 
-def file_path(value: Any, name: str, advice: str = "") -> Path:
+def file_path(value: Any, name: str) -> Path:
     """Return the path of a file; refuse what is none."""
     if not isinstance(value, str | os.PathLike):
-        text = f"{name} must be the path of a file; got {type(value).__name__}."
-        raise ProblemError(text, in_python=advice)
+        raise ProblemError(f"{name} must be the path of a file; got {type(value).__name__}.")
     return Path(value)
 
 

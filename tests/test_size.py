@@ -15,27 +15,27 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3204,
-    "config": 1620,
-    "design": 6008,
+    "config": 1611,
+    "design": 6007,
     "files": 1273,
-    "identification": 9018,
-    "interop": 3734,
-    "linear": 4703,
-    "loop": 3979,
-    "methods": 803,
-    "models": 3744,
+    "identification": 8969,
+    "interop": 3694,
+    "linear": 4697,
+    "loop": 3975,
+    "methods": 802,
+    "models": 3781,
     "report": 3531,
     "storage": 1163,
-    "studies": 3220,
-    "errors, validation": 565,
+    "studies": 3171,
+    "errors, validation": 564,
 }
 COUNTS = {
     "files of the package": 205,
     "public names": 147,
     "tuned constants": 504,
-    "lines of tests": 25126,
+    "lines of tests": 25012,
     "lines of benchmarks": 3998,
-    "words of docs": 60140,
+    "words of docs": 60166,
 }
 
 

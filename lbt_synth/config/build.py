@@ -228,13 +228,14 @@ def _name_matrices() -> Iterator[None]:
     try:
         yield
     except ProblemError as error:
-        message = str(error).replace("influence_matrix", "mirror.influence_matrix")
-        message = message.replace("sensor_matrix", "sensor.matrix")
-        keys = "sensor.matrix", "mirror.influence_matrix"
-        path = min((key for key in keys if key in message), key=message.index, default="")
-        raise ConfigError(message, path=path) from error
+        message = str(error).replace("sensor_matrix", "sensor.matrix")
+        message = message.replace("influence_matrix", "mirror.influence_matrix")
+        if isinstance(error, ConfigError) or message == str(error):
+            raise
+        raise ConfigError(message, path=message.split()[0]) from error
 
 
+@_name_matrices()
 def build_plant(
     settings: FileSection, atmosphere: models.Atmosphere | None, noise_nm: float | FloatArray
 ) -> models.TipTiltPlant:
@@ -242,21 +243,18 @@ def build_plant(
     lines, gain = model_lines(settings), settings.model.sensor_gain
     if isinstance(gain, list):
         _require_length(gain, count_measurements(settings), "model.sensor_gain", "measurement")
-    turbulence = _build_turbulence(settings, atmosphere, noise_nm)
-    mirror = _build_mirror(settings.mirror.local_loop)
-    with _name_matrices():
-        plant = models.tip_tilt_plant(
-            frame_rate_hz=settings.loop.frame_rate_hz,
-            delay_frames=settings.loop.delay_frames,
-            turbulence=turbulence,
-            vibrations=[line for *_, spread in lines for line in spread],
-            noise_nm=noise_nm,
-            sensor_matrix=settings.sensor.matrix,
-            influence_matrix=settings.mirror.influence_matrix,
-            sensor_gain=gain,
-            modes=count_axes(settings),
-            mirror=mirror,
-        )
+    plant = models.tip_tilt_plant(
+        frame_rate_hz=settings.loop.frame_rate_hz,
+        delay_frames=settings.loop.delay_frames,
+        turbulence=_build_turbulence(settings, atmosphere, noise_nm),
+        vibrations=[line for *_, spread in lines for line in spread],
+        noise_nm=noise_nm,
+        sensor_matrix=settings.sensor.matrix,
+        influence_matrix=settings.mirror.influence_matrix,
+        sensor_gain=gain,
+        modes=count_axes(settings),
+        mirror=_build_mirror(settings.mirror.local_loop),
+    )
     if not settings.sensors:
         return plant
     with name_key("sensors"):

@@ -20,14 +20,10 @@ _TWO_DIRECTIONS = "expected at most one of axis, direction_deg"
 _SECTIONS = "how many equal resonances in series it is: a bump of steep flanks has 2 to 4"
 
 
-def _count_given(section: Any, names: Iterable[str]) -> int:
-    return sum(getattr(section, name) is not None for name in names)
-
-
 def goes_with(name: str, other: str) -> Any:
     """Return the rule that a key makes sense beside another one alone."""
     text = f"{other} goes with {name}, and only with it"
-    return rule(lambda s: text if _count_given(s, [name]) < _count_given(s, [other]) else "")
+    return rule(lambda s: text * (getattr(s, name) is None and getattr(s, other) is not None))
 
 
 def by_kind(**keys: tuple[str, ...]) -> Any:
@@ -50,10 +46,7 @@ def by_kind(**keys: tuple[str, ...]) -> Any:
 
 
 def key(text: str, default: Any = ..., **limits: Any) -> Any:
-    """Return a key of a section: what it is, with its unit; its default; limits.
-
-    A type with limits would hide those of the key.
-    """
+    """Return a key: what it is, with its unit; its default; limits, for a type without any."""
     return Field(default, description=text, **limits)
 
 

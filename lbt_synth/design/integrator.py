@@ -211,9 +211,8 @@ def integrator(
 ) -> IntegratorDesign:
     """Integrator ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
 
-    R is the pseudoinverse of the sensor matrix times the influence matrix; combinations of commands
-    that no measurement sees stay zero. The gain is given; or leaves the least residual for a truth;
-    or is the largest one that keeps the margins of the law.
+    R is the pseudoinverse of sensor times influence matrix; what no reading sees stays zero. The
+    gain is given, leaves the least residual for a truth, or is the largest that keeps the margins.
 
     Parameters
     ----------

@@ -41,7 +41,6 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
 
-
 ModalDesign: TypeAlias = Design | MixedController | ModalFilters
 
 
@@ -106,10 +105,8 @@ def target_names() -> tuple[str, ...]:
 
 def target_named(name: str) -> Target:
     """Return one target."""
-    module: Any = import_module(
-        f"lbt_synth.interop.{choice(name, 'target', target_names())}.export"
-    )
-    target: Target = module.TARGET
+    folder = choice(name, "target", target_names())
+    target: Target = import_module(f"lbt_synth.interop.{folder}.export").TARGET
     return target
 
 
@@ -212,7 +209,7 @@ def export(
     options |= {name: value for name, value in mode_options.items() if value is not None}
     if unknown := options.keys() - program.options.keys():
         raise ProblemError(f"{min(unknown)} is no option of target {target}. Leave it out.")
-    settings = {**program.options, **options}
+    settings = {"precision": program.precision, **program.options, **options}
     place = Path(path)
     if program.endings:
         place = require_ending(path, f"a file for {target}", program.endings)
@@ -223,7 +220,6 @@ def export(
     file_numbers = program.join(numbers, parts, count) if program.join else numbers[0]
     pairs = list(zip(parts, numbers, strict=True))
     error = max(rehearsal_error(part.design, program.start(held, np.inf)) for part, held in pairs)
-    precision = settings.get("precision", program.precision)
     files = program.write(place, file_numbers, first, origin, gain_digest=gain_digest, **settings)
     again = program.read(files, file_numbers)
     if not _is_same(again, file_numbers):
@@ -234,13 +230,21 @@ def export(
     checks = _proved(program, pairs, error)
     failed = next((check for check in checks if not check.passed), None)
     if failed is not None or not np.isfinite(error):
-        raise _failure(f"{target} ({precision} precision)", failed, error, program.hint)
+        what, value = f"the commands grow beyond all numbers within {FRAMES} frames", error
+        if failed is not None:
+            value = failed.value
+            what = f"{failed.name} is {value:.6g}, limit {failed.limit:.6g}"
+        raise NumericalError(
+            "the loop must keep what its design promises in the arithmetic of "
+            f"{target} ({settings['precision']} precision); {what}. {program.hint}",
+            status="arithmetic",
+            residual=value,
+        )
     remarks = [program.remark(part.design, held) for part, held in pairs]
     notes = list(dict.fromkeys(filter(None, remarks)))
     if program.contents:
         make_directory(place, parents=False)
     settings |= {"modes": count, "notes": notes, **program.facts(file_numbers, **settings)}
-    settings["precision"] = precision
     kept = {name: value for name, value in sorted(settings.items()) if value is not None}
     certificate = _certificate(files, target, checks, gain_digest, kept)
     return Exported(
@@ -347,16 +351,6 @@ def _designs_of_mixture(control: MixedController) -> list[ModeDesign]:
             law = integrator(single, gain=gain, law=IntegratorLaw(leak=leak))
             designs.append(ModeDesign(law, tuple(modes)))
     return designs
-
-
-def _failure(arithmetic: str, failed: Check | None, error: float, hint: str) -> NumericalError:
-    """Return what fails in the arithmetic of a target, with its value and what to try instead."""
-    what, value = f"the commands grow beyond all numbers within {FRAMES} frames", error
-    if failed is not None:
-        what, value = f"{failed.name} is {failed.value:.6g}, limit {failed.limit:.6g}", failed.value
-    keep = "the loop must keep what its design promises in the arithmetic of"
-    text = f"{keep} {arithmetic}; {what}. {hint}"
-    return NumericalError(text, status="arithmetic", residual=value)
 
 
 def _is_same(one: Any, other: Any) -> bool:

@@ -279,8 +279,7 @@ def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:
     direct = [s.D[:, mode], s.D[:, n:] @ hardware.sensor[:, mode]]
     system = replace(s, B=np.stack(inputs, axis=1), C=s.C[rows], D=np.stack(direct, axis=1)[rows])
     one = hardware.single_mode()
-    mode_loop = replace(loop, system=system, hardware=one)
-    loops = {loop.sensor_gain: mode_loop}
+    loops = {loop.sensor_gain: replace(loop, system=system, hardware=one)}
     return SingleModeLoop(hardware=one, controller=loop.controller, in_frames=True, _loops=loops)
 
 
@@ -288,8 +287,6 @@ def _demand_checks(
     design: Design, loop: ClosedLoop, change: Callable[[float], float] | None
 ) -> list[Check]:
     """Check the demands on each mode in the loop as written; equal modes once."""
-    if not design.mode_specifications:
-        return []
     checks = []
     for mode in sorted(set(design.first_equal_modes)):
         mode_alone = SingleModeLoop(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
+from lbt_synth.errors import DefinitenessError, DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear.controller import Controller
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two, transpose
 from lbt_synth.linear.state_space import LinearSystem, StateSpace
@@ -61,9 +61,7 @@ class EstimationProblem(LinearSystem):
     DimensionError
         If sizes clash, or no measurement is ever read.
     NonFiniteError
-        If an entry is NaN or infinite.
-    ProblemError
-        If an entry is above 1e75: products of the matrices would not be numbers.
+        If an entry is NaN or infinite, or above 1e75.
     DefinitenessError
         If ``D D'`` is singular: some combination of measurements is free of noise.
 
@@ -107,12 +105,8 @@ class EstimationProblem(LinearSystem):
     def _require_computable(self) -> None:
         """Refuse entries beyond all units, and readings with a combination free of noise."""
         for name in "ABCDL":
-            largest = np.max(np.abs(getattr(self, name)), initial=0.0)
-            if largest > _EXTREME:
-                raise ProblemError(
-                    f"the entries of {name} must be at most {_EXTREME:g}; got {largest:g}. Check "
-                    "the units."
-                )
+            if (most := np.max(np.abs(getattr(self, name)), initial=0.0)) > _EXTREME:
+                raise NonFiniteError(f"{name} must be within {_EXTREME:g}; got {most:g}. Scale it.")
         for t in range(self.period):
             D = self.read_parts(t)[3]
             sizes = np.maximum(np.linalg.norm(D, axis=1, keepdims=True), 1 / _EXTREME)

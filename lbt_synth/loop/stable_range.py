@@ -49,7 +49,7 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, require_instance
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number
 
 AffinePart: TypeAlias = tuple[FloatArray, FloatArray]  # A0 and A1 of ``A0[t] + g A1[t]``
 
@@ -147,7 +147,6 @@ def stable_sensor_gains(
     >>> low, round(high, 6)  # 0.618034 / 0.5
     (0.0, 1.236068)
     """
-    require_instance(hardware, LoopHardware, "hardware")
     return stable_range(parts_by_gain(hardware, controller), number(nominal, "nominal", above=0))
 
 

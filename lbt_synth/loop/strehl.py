@@ -128,13 +128,10 @@ def strehl(
         stable, jitter = np.asarray(residual.stable), residual.gaussian_nm2
         lines = residual.line_amplitudes_nm
     else:
-        covariance = real_array(residual, "the covariance")
-        if not covariance.ndim:
-            raise DimensionError(
-                "the covariance must be a matrix of one or two axes [nm^2]; got a number. Try "
-                "[[rms_nm**2]], or rms_nm**2 / 2 * np.eye(2) for as much on tip as on tilt."
-            )
-        jitter = semidefinite(covariance, "the covariance", stacked=True)
+        if not np.ndim(residual):
+            got = type(residual).__name__
+            raise DimensionError(f"the covariance must be a matrix; got {got}. Try [[rms_nm**2]].")
+        jitter = semidefinite(residual, "the covariance", stacked=True)
         stable, lines = np.ones(jitter.shape[:-2], bool), np.asarray(line_amplitudes_nm, complex)
         real_array(np.abs(lines), "line_amplitudes_nm")
         lines = lines if lines.size else np.zeros((*stable.shape, 0, jitter.shape[-1]), complex)

@@ -57,9 +57,8 @@ def exactly_one(*names: str) -> Any:
 
     def mistake(section: Any) -> str:
         used = [name for name in names if getattr(section, name) is not None]
-        if len(used) == 1:
-            return ""
-        return f"expected exactly one of {', '.join(names)}; got {' and '.join(used) or 'none'}"
+        text = f"expected exactly one of {', '.join(names)}; got {' and '.join(used) or 'none'}"
+        return "" if len(used) == 1 else text
 
     return rule(mistake)
 

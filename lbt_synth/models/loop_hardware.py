@@ -104,18 +104,15 @@ class LoopHardware(Summarised):
             n = influence.shape[0]
         if n < 1 or (influence is not None and influence.shape[1] < 1):
             raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
-        if sensor is not None and influence is not None:
-            sizes = np.linalg.norm(sensor) * np.linalg.norm(influence)
-            if sizes > 0 and np.linalg.norm(sensor @ influence) <= BLIND * sizes:
-                raise ProblemError(
-                    "the sensor must see something that the mirror moves; got a sensor_matrix "
-                    "times influence_matrix of zeros."
-                )
         matrices = {"sensor_matrix": sensor, "influence_matrix": influence}
         for name, value in matrices.items():
             if value is not None and not np.any(value):
                 raise ProblemError(f"{name} must respond to something; got only zeros.")
             matrices[name] = frozen_copy(np.eye(n)) if value is None else value
+        if sensor is not None and influence is not None:
+            sizes = np.linalg.norm(sensor) * np.linalg.norm(influence)
+            if np.linalg.norm(sensor @ influence) <= BLIND * sizes:
+                raise ProblemError("sensor_matrix must see something that influence_matrix moves.")
         check_fields(self, modes=n, **matrices)
         if self.mirror is not None:
             _ = self.mirror_system  # refuses a mirror that does not fit the frame rate

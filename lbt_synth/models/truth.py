@@ -102,8 +102,7 @@ class Truth(Summarised):
                     "turbulence must have a method psd(frequency_hz), or be None, or a sequence "
                     f"of these, one per mode; got {type(part).__name__}."
                 )
-        vibrations = sequence(self.vibrations, "vibrations")
-        for line in vibrations:
+        for line in sequence(self.vibrations, "vibrations"):
             if not isinstance(line, TrueVibration):
                 raise ProblemError(
                     "vibrations must be Vibration or SinusoidalVibration; got "
@@ -118,7 +117,7 @@ class Truth(Summarised):
         check_fields(
             self,
             turbulence=parts if isinstance(turbulence, Sequence) else turbulence,
-            vibrations=vibrations,
+            vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
             frequency_errors_hz=errors,
             motions=tuple(self.motions) if any(self.motions) else ({},) * len(self.vibrations),

@@ -7,7 +7,7 @@ mean variance. Each night counts in units of what its own design leaves: the mea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -29,9 +29,7 @@ from lbt_synth.loop import residual_budget
 from lbt_synth.methods.method import DesignInputs
 from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import design_request
-from lbt_synth.models import TipTiltPlant, Vibration
-from lbt_synth.models.plant.assembly import PlantParts
-from lbt_synth.models.plant.tip_tilt import assemble
+from lbt_synth.models.plant.tip_tilt import mean_plant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, choice
@@ -229,53 +227,6 @@ def _residuals_nm(design: Design, nights: Mapping[str, RecordedDesign]) -> dict[
         if loop.is_stable and unstable_gains(design, night.gains) is None:
             residual_nm[name] = float(residual_budget(loop, night.model.plant()).rms_nm)
     return residual_nm
-
-
-def mean_plant(plants: Sequence[TipTiltPlant], weights: Sequence[float]) -> TipTiltPlant:
-    """Return the plant whose spectra are the weighted means of those of plants of one loop.
-
-    Lines that overlap become one of their power, and the turbulence has the shape of that plant
-    whose driving noise weighs most. The sensor gain is the geometric mean.
-    """
-    shares, hardware = np.array(weights) / np.sum(weights), plants[0].hardware
-    gains = np.array([np.diag(plant.hardware.sensor) for plant in plants])
-    gain = np.exp(np.mean(np.log(gains), axis=0))
-    noises = [p.R * np.outer(gain / own, gain / own) for p, own in zip(plants, gains, strict=True)]
-    air = []
-    for models in zip(*(plant.turbulence for plant in plants), strict=True):
-        powers = shares * [model.driving_rms_nm**2 for model in models]
-        strongest = models[int(np.argmax(powers))]
-        air.append(replace(strongest, driving_rms_nm=float(np.sqrt(np.sum(powers)))))
-    lines = [
-        replace(line, rms_nm=float(np.sqrt(share)) * line.rms_nm)
-        for share, plant in zip(shares, plants, strict=True)
-        for line in plant.vibrations
-    ]
-    return assemble(
-        PlantParts(
-            hardware=replace(hardware, sensor_matrix=np.diag(gain)),
-            turbulence=tuple(air),
-            vibrations=tuple(_merge(lines)),
-            noise_factor=np.linalg.cholesky(np.tensordot(shares, noises, 1)),
-        )
-    )
-
-
-def _merge(lines: Sequence[Vibration]) -> list[Vibration]:
-    """Return lines, with one for those of a direction that are nearer than their half widths."""
-    merged = list[Vibration]()
-    for line in sorted(lines, key=lambda one: (one.direction, one.sections, one.frequency_hz)):
-        last = merged[-1] if merged else line
-        half_hz, wider_hz = sorted(one.damping * one.frequency_hz for one in (last, line))
-        same = (last.direction, last.sections) == (line.direction, line.sections)
-        is_near = line.frequency_hz - last.frequency_hz < half_hz and wider_hz < 2 * half_hz
-        if merged and same and is_near:
-            weak, strong = sorted((merged.pop(), line), key=lambda one: one.rms_nm)
-            rms_nm = float(np.hypot(weak.rms_nm, strong.rms_nm))
-            move_hz = (weak.rms_nm / rms_nm) ** 2 * (weak.frequency_hz - strong.frequency_hz)
-            line = replace(strong, frequency_hz=strong.frequency_hz + move_hz, rms_nm=rms_nm)
-        merged.append(line)
-    return merged
 
 
 def require_one_loop(nights: Mapping[str, LoopRecord]) -> None:

@@ -60,21 +60,16 @@ def test_reconstructor_inverts_any_sensor():
     assert np.allclose(one, other, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("sensor", "influence"),
-    [
-        (None, [[1, 0, 1], [0, 1, 1]]),
-        (None, [[1, 1], [1, 1]]),
-        ([[1, 0.5]], None),
-        ([[1 / 3, 2 / 3], [1 / 6, 1 / 3]], [[1, 0.1], [0.3, 7]]),
-    ],
-)
+FLAT = [(None, [[1, 0, 1], [0, 1, 1]]), (None, [[1, 1], [1, 1]]), ([[1, 0.5]], None)]
+FLAT += [([[1 / 3, 2 / 3], [1 / 6, 1 / 3]], [[1, 0.1], [0.3, 7]])]
+
+
+@pytest.mark.parametrize(("sensor", "influence"), FLAT)
 @pytest.mark.parametrize("law", [IntegratorLaw(), IntegratorLaw(integrators=2, zero_hz=5)])
 def test_what_is_seen_and_moved_has_the_usual_loop_and_the_rest_has_none(sensor, influence, law):
     path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=sensor, influence_matrix=influence)
     design, usual = (lbt.integrator(p, gain=0.3, law=law) for p in (path, PATH))
-    frequencies = [0.5, 10, 100]
-    one, other = (lbt.close_loop(d.hardware, d).sensitivity(frequencies) for d in (design, usual))
+    one, other = (lbt.close_loop(d.hardware, d).sensitivity([1, 99]) for d in (design, usual))
     corrected = path.influence @ np.linalg.pinv(path.sensor @ path.influence, 1e-9) @ path.sensor
     assert np.allclose(one, np.eye(2) + (other - 1) * corrected, atol=1e-9)
     truth = lbt.Truth(turbulence=SLOW, noise_nm=5.0)

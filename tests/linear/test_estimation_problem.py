@@ -82,7 +82,7 @@ def test_problems_that_are_none():
         (walk(C=np.ones((0, 1)), D=np.ones((0, 3))), DimensionError, "C with 0 rows"),
         (walk(D=alike), DefinitenessError, "read at phase 1 is"),
         (walk(D=np.zeros((1, 2, 3))), DefinitenessError, "read at phase 0 is singular"),
-        (walk(L=[[1e200]]), ProblemError, r"of L must be at most 1e\+75; got"),
+        (walk(L=[[1e200]]), ProblemError, r"L must be within 1e\+75; got"),
         (walk(D=np.zeros((2, 3)), read=None), DefinitenessError, "Every measurement needs noise"),
         (lambda: problem.ahead(0), ProblemError, ahead),
         (lambda: problem.with_memory([[1.0, 1.0]]), ProblemError, "a filter with a memory needs"),

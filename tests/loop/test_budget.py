@@ -17,6 +17,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.budget import residual_budget, residual_spectrum
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import Accelerometer, Motion, PositionLoop, Truth, WavefrontSensor
 
 # Loops in continuous time, run in small steps from their equations, without the package's.
@@ -327,6 +328,7 @@ def test_refusals():
     rows = [
         (lambda: lbt.close_loop(single, LAZY), DimensionError, "got 2 to 2"),
         (lambda: lbt.close_loop(fast, LAZY), ProblemError, "for 800"),
+        (lambda: youla_controller(single, LAZY), DimensionError, "to 1 commands; got 2 to 2"),
         (lambda: met(sensor_gain=0.5), ProblemError, "truth's sensor gain 0.5; got 1"),
         (lambda: met(sinusoid(10, 1, (1, 0, 0))), DimensionError, "must have 2 components"),
         (lambda: met(sinusoid(600, 1)), ProblemError, "below the Nyquist"),

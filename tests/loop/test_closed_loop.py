@@ -8,7 +8,6 @@ from support.lqg import shell
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.errors import DimensionError
 from lbt_synth.loop.closed_loop import youla_controller
 
 SHELL = shell(70, delay_samples=2)
@@ -45,9 +44,3 @@ def test_the_closed_loop_is_affine_in_the_filter(delay, direct, moving):
     np.testing.assert_allclose(loop.sensitivity(f), np.eye(2) - M @ Q @ sensor / z, atol=1e-10)
     noise = loop.path("noise", "residual").frequency_response(f)
     np.testing.assert_allclose(noise, -M @ Q, atol=1e-10)
-
-
-def test_a_filter_of_another_size_is_refused():
-    one = lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800)
-    with pytest.raises(DimensionError, match="map 2 measurements to 2 commands; got 1 to 1"):
-        youla_controller(lbt.LoopHardware(frame_rate_hz=800), one)

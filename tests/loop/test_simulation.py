@@ -63,14 +63,12 @@ def test_refusals(axis_plant, sensors_design, sensors_config):
     line = lbt.models.SinusoidalVibration(frequency_hz=5, rms_nm=1)
     shaken = lbt.Truth(turbulence=None, vibrations=(line,))
     gain = lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0)
-    broken, turning = (
-        SimpleNamespace(step=lambda _y, u=u: np.array([u]), reset=lambda: None)
-        for u in (np.nan, 1j)
-    )
+    broken = SimpleNamespace(step=lambda _y: np.array([np.nan]), reset=lambda: None)
+    turning = SimpleNamespace(step=lambda y: 1j * y, reset=broken.reset)
 
-    def run(controller=filters, met=truth, **options):
-        options = {"frames": 10, "hardware": hardware} | options
-        return lambda: lbt.simulate(controller, met, **options)
+    def run(controller=filters, met=truth, **counts):
+        facts = {"hardware": hardware, "frames": 10} | counts
+        return lambda: lbt.simulate(controller, met, **facts)
 
     def fail(**facts):
         drop = {"unit": "m1", "start_s": 0} | facts

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import partial
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -168,24 +167,6 @@ def test_what_a_clip_sees_is_the_loop_broken_at_the_command(delay, influence, mi
         assert strokes(hardware, law, sensor_gain=gain) == pytest.approx(expected, rel=1e-3)
 
 
-def common_lyapunov(A, B):
-    """Largest ``t`` with ``P - A'PA >= t``, ``P - B'PB >= t`` and ``tr P = n``."""
-    P, t = cp.Variable((len(A), len(A)), symmetric=True), cp.Variable()
-    rests = [P - M.T @ P @ M - t * np.eye(len(A)) for M in (A, B)]
-    bounds = [(rest + rest.T) / 2 >> 0 for rest in rests]
-    problem = cp.Problem(cp.Maximize(t), [*bounds, P >> 0, cp.trace(P) == len(A)])
-    return problem.solve(solver=cp.CLARABEL)
-
-
-def test_a_common_lyapunov_function_of_clips_exists_inside_and_none_beyond():
-    """``v(k) = d v(k-1) - g d v(k-3)`` of an integrator of three frames, given the last command."""
-    _, ratio = strokes(*one_pole(1.0, delay_frames=3))
-    assert 2 < ratio < 4
-    for factor, proved in ((0.99, True), (1.01, False)):
-        clips = [np.array([[d, 0, -d / 2], [1, 0, 0], [0, 1, 0]]) for d in (1 / factor / ratio, 1)]
-        assert (common_lyapunov(*clips) > 0) == proved
-
-
 def clipped_runs(design, kicks, *, estimator, frames=3000):
     """Return the largest request and the residuals of loops of two frames, one a column of kicks.
 
@@ -232,7 +213,6 @@ def test_refusals():
         (lambda: moving_gain(lbt.close_loop(*strong)), unstable, "unstable"),
         (lambda: ratio(*strong), unstable, "unstable"),
         (several, lbt.errors.ProblemError, "several sensors"),
-        (lambda: lbt.loop.stable_sensor_gains(plant, 1), ValueError, "must be a LoopHardware"),
     ]
     require_refusals(rows)
 

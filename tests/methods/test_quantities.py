@@ -1,7 +1,8 @@
 """Every number of a configuration has limits, at which it is computed or refused."""
 
 import contextlib
-from functools import partial
+from functools import partial, reduce
+from itertools import product
 from typing import get_args, get_origin
 
 import numpy as np
@@ -26,55 +27,44 @@ SIGNED = """
 """
 
 
-def declared_numbers(annotation, bounds=(), path="", place=()):
-    """Yield each number that a type of the schema can hold, all its bounds, and its place.
+BEYOND = {"ge": -1, "gt": 0, "le": 1, "lt": 0}  # a step from a limit to what is refused
 
-    The place is the section, the kind of number, and in how many lists it stands.
-    """
+
+def declared_numbers(annotation, bounds=(), path="", section=None, lists=0):
+    """Yield each number that a type can hold, its bounds, section, kind and depth in lists."""
     bounds = (*bounds, *getattr(annotation, "__metadata__", ()))
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for name, field in annotation.model_fields.items():
-            place = annotation, None, 0
-            declared = field.annotation, tuple(field.metadata)
-            yield from declared_numbers(*declared, f"{path}.{name}", place)
+            declared = field.annotation, tuple(field.metadata), f"{path}.{name}"
+            yield from declared_numbers(*declared, annotation)
     elif annotation in (int, float):
         limits = [getattr(bound, "metadata", None) or [bound] for bound in bounds]
-        yield path, [one for some in limits for one in some], (place[0], annotation, place[2])
+        yield path, [one for some in limits for one in some], section, annotation, lists
+    deeper = lists + (get_origin(annotation) is list)
     for argument in get_args(annotation):
-        lists = place[2] + (get_origin(annotation) is list)
-        yield from declared_numbers(argument, bounds, path, (*place[:2], lists))
+        yield from declared_numbers(argument, bounds, path, section, deeper)
 
 
-def require_refused_beyond(bound, name, section, kind, lists):
-    """Require that a section refuses what is just beyond a limit of a key."""
-    for relation, step in {"ge": -1, "gt": 0, "le": 1, "lt": 0}.items():
-        if hasattr(bound, relation):
-            limit = kind(getattr(bound, relation))
-            value = limit + step if kind is int else float(np.nextafter(limit, limit + step))
-            for _ in range(lists):
-                value = [value]
-            mistakes = refused(
-                partial(section.model_validate, {name: value}), ValidationError, name
-            )
-            kinds = [one["type"] for one in mistakes.errors() if one["loc"][0] == name]
-            assert len(kinds) == 1, (section, name, relation)
-            assert "than" in kinds[0], kinds
-
-
-def test_every_number_of_the_schema_has_limits():
+def test_every_number_of_the_schema_has_limits_that_hold():
     numbers = list(declared_numbers(FileSection))
     assert len(numbers) > 80
-    for path, bounds, place in numbers:
+    for path, bounds, section, kind, lists in numbers:
         low, high = (
             [getattr(bound, name) for bound in bounds for name in names if hasattr(bound, name)]
             for names in (("ge", "gt"), ("le", "lt"))
         )
         least, most, name = max(low), min(high), path.rpartition(".")[2]
-        for bound in bounds:
-            require_refused_beyond(bound, name, *place)
         assert most <= 1e12 or name == "seed", path
         is_signed = least == -most and name in SIGNED.split()
         assert least > 1e-13 or is_signed or (least == 0 and name in FROM_ZERO.split()), path
+        for bound, (relation, step) in product(bounds, BEYOND.items()):
+            if hasattr(bound, relation):
+                limit = kind(getattr(bound, relation))
+                value = limit + step if kind is int else np.nextafter(limit, limit + step).item()
+                content = {name: reduce(lambda inner, _: [inner], range(lists), value)}
+                error = refused(partial(section.model_validate, content), ValidationError, name)
+                mistakes = [one["type"] for one in error.errors() if one["loc"][0] == name]
+                assert ["than" in mistake for mistake in mistakes] == [True], (path, limit)
 
 
 def limits(path):

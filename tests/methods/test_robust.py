@@ -1,6 +1,5 @@
 """The robust section of a configuration."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,7 +11,7 @@ import lbt_synth as lbt
 from lbt_synth.design.shaping import VibrationBand
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.methods.method import DesignInputs
-from lbt_synth.methods.registry import method_named, reference_methods
+from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import design_request
 from lbt_synth.models import ARModel, TipTiltPlant
 
@@ -160,38 +159,3 @@ def test_bands_have_an_axis_and_the_damping_of_the_model(design):
         [(16.0, 0.01), (60.0, 0.0)],
         [(30.0, 0.03), (60.0, 0.0)],
     ]
-
-
-def worst_in_bands(config, design):
-    """Return the worst variance with the resonances of the truth anywhere in their bands [nm^2]."""
-    loop = lbt.close_loop(config.hardware, design.controller)
-    total = lbt.residual_budget(loop, replace(config.truth, vibrations=())).rms_nm ** 2
-    bands = config.settings.design.robust.bands
-    for line, band in zip(config.truth.vibrations, bands, strict=True):
-        places_hz = np.linspace(band.low_hz, band.high_hz, 9).tolist()
-        lines = [replace(line, frequency_hz=f) for f in places_hz]
-        truths = [lbt.Truth(turbulence=None, vibrations=(line,)) for line in lines]
-        total += max(lbt.residual_budget(loop, truth).rms_nm ** 2 for truth in truths)
-    return total
-
-
-def test_robust_stays_beside_the_filters_within_its_bands(tmp_path):
-    """A loop of 8 m with two resonances, of which the bands do not say the damping."""
-    lines, bands = [], []
-    for axis, f, rms, half in (("tip", 18.0, 116.0, 2.0), ("tilt", 48.0, 78.0, 3.0)):
-        shake = {"axis": axis, "rms_nm": rms}
-        lines.append(shake | {"frequency_hz": f, "damping": 0.01})
-        bands.append(shake | {"low_hz": f - half, "high_hz": f + half})
-    content = minimal_config(
-        sensor={"noise_nm": 20.0},
-        loop={"frame_rate_hz": 1000.0, "delay_frames": 2.0},
-        model={"vibrations": lines},
-        truth={"turbulence": "model", "vibrations": [{"kind": "resonance", **x} for x in lines]},
-        design={"robust": {"bands": bands, "functions": 30, "states": None}},
-    )
-    config = lbt.load_config(write_config(tmp_path, content))
-    filters = [
-        worst_in_bands(config, config.design(method.name, **method.reference_options))
-        for method in reference_methods()
-    ]
-    assert worst_in_bands(config, config.design("robust")) < 1.01 * min(filters)

@@ -13,8 +13,9 @@ import lbt_synth as lbt
 from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification import LoopRecord
 from lbt_synth.models import TipTiltPlant, Vibration
+from lbt_synth.models.plant.tip_tilt import mean_plant
 from lbt_synth.studies import design_from_nights, nights
-from lbt_synth.studies.nights import ALL, NightsDesign, mean_plant
+from lbt_synth.studies.nights import ALL, NightsDesign
 
 STILL = (58.0, 0.01, 25.0)  # a line that does not move: frequency [Hz], damping ratio, rms [nm]
 MOVING = (0.004, 60.0)  # damping ratio and rms [nm] of one that does

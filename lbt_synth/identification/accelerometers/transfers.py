@@ -18,14 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import detrend
-from scipy.signal.windows import tukey
 from scipy.special import gammaincc
 
 from lbt_synth.design.filter_design import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.readings import read_channels
+from lbt_synth.identification.accelerometers.readings import Channels, read_channels
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedLine, IdentifiedModel
-from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, TAPER
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, TAPER, tukey
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
@@ -144,9 +143,7 @@ def accelerometer_transfers(
         shifts = 1 + np.ceil(4 * widest_hz * largest_shift_s)  # that differ
         limit = 1e-3 / (len(read.names) * len(lines) * shifts)
         largest = int(largest_shift_s * model.frame_rate_hz)
-        lag, fits, shift, error = _lay_and_fit(
-            model, record, lines, read.values, read.good, largest, limit
-        )
+        lag, fits, shift, error = _lay_and_fit(model, record, lines, read, largest, limit)
         shown = fits.chances < limit
         # the channels that show most of the lines' power, as many as a design takes
         power = (fits.coherences * shown) @ np.array([line.rms_nm**2 for line in lines])
@@ -219,7 +216,7 @@ class _Bands:
 
 def _transform(series: FloatArray, rate: float, inside: BoolArray) -> ComplexArray:
     """Return tapered transforms in bands (f, n), whose squares are densities, without a slope."""
-    taper = tukey(len(series), TAPER)
+    taper = tukey(len(series))
     scale = np.sqrt(2 / (rate * np.sum(taper**2)))
     transforms = [scale * np.fft.rfft(taper * detrend(column))[inside] for column in series.T]
     return np.stack(transforms, axis=1)
@@ -277,8 +274,7 @@ def _lay_and_fit(
     model: IdentifiedModel,
     record: LoopRecord,
     lines: Sequence[IdentifiedLine],
-    readings: FloatArray,
-    good: BoolArray,
+    channels: Channels,
     largest: int,
     limit: float,
 ) -> tuple[int, _Fits, float, float]:
@@ -290,17 +286,18 @@ def _lay_and_fit(
 
     def beside(lag: int) -> list[_Bands]:
         frames = np.arange(record.frames) + lag
-        rows = np.clip(frames, 0, len(readings) - 1)
-        usable = record.usable & (frames == rows) & good[rows]
+        rows = np.clip(frames, 0, len(channels.good) - 1)
+        usable = record.usable & (frames == rows) & channels.good[rows]
         bands = [
-            _make_bands(model, lines, wavefront[start:stop], readings[rows[start:stop]])
+            _make_bands(model, lines, wavefront[start:stop], channels.values[rows[start:stop]])
             for start, stop in runs(usable).tolist()
             if stop - start >= SHORTEST_SEGMENT
         ]
         if not bands:
             raise ProblemError(
                 f"record and accelerations must have {SHORTEST_SEGMENT} usable frames in a row "
-                f"side by side; they have {record.frames} and {len(readings)} frames."
+                f"side by side; they have {record.frames} and {len(channels.good)} "
+                "frames."
             )
         return bands
 

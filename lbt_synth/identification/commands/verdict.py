@@ -84,8 +84,8 @@ class CommandVerdict:
         """What to do about it; empty if nothing is wrong."""
         if self.accepted:
             return ""
-        if self._is_misread:
-            return f"leave {self.read_with} out"
+        if self._wrong_options:
+            return f"leave {self._wrong_options} out"
         if self.repair.options:
             return f"read the record with {self._options}"
         advice = self.explanation.partition(". ")[2]
@@ -97,16 +97,15 @@ class CommandVerdict:
         return f"{self.read_with} {self.repair.options}".strip() if self.repair.options else ""
 
     @property
-    def _is_misread(self) -> bool:
-        """Whether the record was read with options that are wrong, or that another one replaces."""
+    def _wrong_options(self) -> str:
+        """The options with which the record was read, if one is wrong or another replaces it."""
         asked, read_with = (
             {word for word in options.split() if word.startswith("--")}
             for options in (self.repair.options, self.read_with)
         )
-        wrong = {"--command-increments"} | (asked or read_with)
-        if asked & {"--swap-axes", "--command-sign"}:
-            wrong |= {"--command-matrix"}
-        return bool(wrong & read_with)
+        turns = {"--command-matrix"} if asked & {"--swap-axes", "--command-sign"} else set[str]()
+        wrong = {"--command-increments"} | turns | (asked or read_with)
+        return self.read_with if wrong & read_with else ""
 
     @property
     def overruled(self) -> tuple[str, ...]:
@@ -127,16 +126,16 @@ class CommandVerdict:
         if self.accepted:
             return
         law = "" if self.law is None else f" ({self.law.name} fits them{self.law.lag_text})"
-        options = "" if self._is_misread else self._options
-        remedy = f"Try {options}{', or ' * bool(options)}--accept-record to go on as it is."
-        if self._is_misread:
-            remedy = f"Leave {self.read_with} out, or give --accept-record to go on as it is."
+        options = "" if self._wrong_options else self._options
+        try_first = f"Try {options}, or" if options else "Try"
+        if self._wrong_options:
+            try_first = f"Leave {self._wrong_options} out, or give"
         raise RecordError(
             f"the commands do not reach the measurements as given: {self.explanation}{law}.",
             explanation=self.explanation,
             options=options,
             in_python=f"Repair them as the options {options} do." if options else "",
-            at_terminal=remedy,
+            at_terminal=f"{try_first} --accept-record to go on as it is.",
         )
 
 
@@ -160,20 +159,14 @@ def explain_commands(
     law, commands = fit_control_law(record), record.commands[record.usable]
     still = np.all(commands == commands[:1], axis=0)
     if still.all() or not still.any():
-        return replace(_explain(record, law, known), read_with=record.read_with)
+        return _explain(record, law, known)
     # the loop of the other axis was open
     y, u = record.measurements[:, ~still], record.commands[:, ~still]
     moving = replace(record, measurements=y, commands=u)
     verdict = _explain(moving, fit_control_law(moving), None if known is None else known[~still])
     gain = np.where(still, np.nan, verdict.gain)
     note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
-    return replace(
-        verdict,
-        gain=frozen_copy(gain),
-        law=law,
-        notes=(*verdict.notes, note),
-        read_with=record.read_with,
-    )
+    return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
 
 
 def _explain(
@@ -181,7 +174,8 @@ def _explain(
 ) -> CommandVerdict:
     """Explain the commands of axes that move, of which the record shows a law."""
     law = None if shown is None or shown.kind == "none" else shown
-    refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
+    unknown = np.full(record.axes, np.nan)
+    refuse = partial(CommandVerdict, gain=unknown, law=shown, read_with=record.read_with)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
         return refuse(explanation=doubt)

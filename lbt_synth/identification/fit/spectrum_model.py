@@ -79,11 +79,6 @@ class Component:
             return np.asarray(np.eye(axes)[self.axis])
         return np.array([1.0, self.sign * math.exp(0.5 * self.log_ratio)])
 
-    def on(self, axis: int) -> Component:
-        """Return what one axis shows of a component that two share."""
-        power = self.log_power + axis * self.log_ratio
-        return replace(self, log_power=power, axis=0, log_ratio=0.0, sign=1.0)
-
     def shift(self, log_frequency: float, damping: float, log_power: float) -> Component:
         """Return the component with its numbers changed by these."""
         return replace(
@@ -214,5 +209,9 @@ class SpectrumModel:
         """Return what axis i shows, its turbulence first, then its own components."""
         own = [replace(c, axis=0, log_ratio=0.0) for c in self.components if c.axis == i]
         own.sort(key=lambda c: c.kind != "turbulence")
-        shared = [c.on(i) for c in self.components if c.axis is None]
+        shared = [
+            replace(c.shift(0.0, 0.0, i * c.log_ratio), axis=0, log_ratio=0.0, sign=1.0)
+            for c in self.components
+            if c.axis is None
+        ]
         return SpectrumModel((self.axes[i],), (*own, *shared), self.roll_off_order)

@@ -130,13 +130,6 @@ def _noise_density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray
     return np.array(rows)
 
 
-def _log_colour_slope(colour: float, s: FloatArray) -> FloatArray:
-    """Return the slope of the logarithm of that density by the colour, (f,)."""
-    a = np.tanh(colour)
-    below = (1 - a) ** 2 + a * s
-    return np.asarray(-2 * a + (1 - a**2) * (2 * (1 - a) - s) / below)
-
-
 def _smear(
     data: LoopPeriodogram,
     components: Sequence[Component],
@@ -168,12 +161,13 @@ def _smear(
 
 
 def _log_fall(
-    data: LoopPeriodogram, log_corner: float, order: float
+    data: LoopPeriodogram, spectrum: SpectrumModel, turbulence: Component
 ) -> tuple[FloatArray, FloatArray]:
     """Return the roll-off of turbulence as frames show it, a logarithm, and its slope, (f,)."""
-    fall, slope = log_roll_off(float(np.exp(log_corner)), order, data.half_angle_square)
+    corner = float(np.exp(spectrum.axes[turbulence.axis or 0].log_corner))
+    fall, slope = log_roll_off(corner, spectrum.roll_off_order, data.half_angle_square)
     # a frame shows the mean of the phase; a process of finite order is one of means
-    return fall if order == 1 else fall + data.log_frame_mean, slope
+    return fall if spectrum.roll_off_order == 1 else fall + data.log_frame_mean, slope
 
 
 def part_densities(
@@ -189,8 +183,7 @@ def part_densities(
     density *= 2 / data.frame_rate_hz * np.exp(log_power)[:, None]
     for row, component in zip(density, components, strict=True):
         if component.kind == "turbulence":
-            log_corner = spectrum.axes[component.axis or 0].log_corner
-            row *= np.exp(_log_fall(data, log_corner, spectrum.roll_off_order)[0])
+            row *= np.exp(_log_fall(data, spectrum, component)[0])
     _smear(data, components, density)
     return density
 
@@ -268,8 +261,7 @@ def densities(
     by_corner = np.zeros_like(density)
     for i, component in enumerate(components):
         if component.kind == "turbulence":
-            log_corner = spectrum.axes[component.axis or 0].log_corner
-            fall, by_corner[i] = _log_fall(data, log_corner, spectrum.roll_off_order)
+            fall, by_corner[i] = _log_fall(data, spectrum, component)
             density[i] *= np.exp(fall)
     _smear(data, components, density, slopes)
     slopes[:, 1] *= slope[:, None]
@@ -291,18 +283,15 @@ def derivatives(
     matrix = np.eye(n)[:, :, None] * (noise + held)
     matrix += np.tensordot(directions[:, :, None] * directions[:, None], parts, (0, 0))
     whitening, log_determinant = _whiten(matrix)
-
-    def whiten(other: FloatArray) -> FloatArray:
-        return _vector(np.einsum("ikf,klf,jlf->ijf", whitening, other, whitening))
-
     # each slope of S, whitened
     along = np.einsum("ijf,cj->cif", whitening, directions)
     weights = _outer(along, along) * parts[:, None]
     rows = np.zeros((spectrum.place(len(parts)), *weights.shape[1:]))
     for i, axis in enumerate(spectrum.axes):
-        at, unit = BACKGROUND * i, whitening[:, i]
+        at, unit, a = BACKGROUND * i, whitening[:, i], np.tanh(axis.colour)
         rows[at + NOISE] = noise[i] * _outer(unit, unit)
-        rows[at + COLOUR] = rows[at + NOISE] * _log_colour_slope(axis.colour, s)
+        by_colour = -2 * a + (1 - a**2) * (2 * (1 - a) - s) / ((1 - a) ** 2 + a * s)
+        rows[at + COLOUR] = rows[at + NOISE] * by_colour
     for k, component in enumerate(spectrum.components):
         if component.kind == "turbulence":
             rows[BACKGROUND * (component.axis or 0) + CORNER] = by_corner[k] * weights[k]
@@ -313,7 +302,8 @@ def derivatives(
         turned = np.einsum("ijf,j->if", whitening, directions[k] * [0.0, 1.0])
         components[k, PARAMETERS] = _outer(along[k], turned) * parts[k]
 
-    measured, unit = whiten(data.matrix(spectrum.gains)), _vector(np.eye(n)[:, :, None])
+    seen = np.einsum("ikf,klf,jlf->ijf", whitening, data.matrix(spectrum.gains), whitening)
+    measured, unit = _vector(seen), _vector(np.eye(n)[:, :, None])
     rows *= root
     flat = rows.reshape(len(rows), -1)
     gradient, information = flat @ (root * (unit - measured)).ravel(), flat @ flat.T

@@ -36,14 +36,20 @@ def build_clock(
     times = None if times_s is None else _check_rising(times_s, "times_s", rows)
     frame = np.arange(rows)
     if frame_numbers is not None:
-        frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
+        numbers = _check_rising(frame_numbers, "frame_numbers", rows)
+        if not np.array_equal(numbers, np.round(numbers)):
+            raise ProblemError("frame_numbers must be whole numbers; got fractions.")
+        _require_few_holes(float(numbers[-1]) - float(numbers[0]) + 1, rows)
+        frame = np.asarray(numbers - numbers[0], dtype=np.int64)
     if times is None or rows == 1:
         if rate is None:
             raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
         return Clock(rate, frame, [])
     if frame_numbers is None:
         frame = _frames_from_times(times, rate)
-    rate_of_times, off = _fit_rate(times, frame)
+    t, n = times - times.mean(), frame - frame.mean()
+    slope = float(n @ n) / float(n @ t)  # of a straight line
+    rate_of_times, off = float(f"{slope:.9g}"), slope * t - n  # the second in frames
     notes = [] if rate is not None else [f"frame rate {rate_of_times:.9g} Hz, from the times"]
     rate = rate_of_times if rate is None else rate
     frames = float(frame[-1])
@@ -75,14 +81,6 @@ def _check_rising(values: ArrayLike, name: str, rows: int) -> FloatArray:
             f"{k + 1}. Cut the record there, or sort its rows."
         )
     return out
-
-
-def _frames_from_counter(numbers: FloatArray) -> IntArray:
-    """Return the frame of each row, from 0, by a counter."""
-    if not np.array_equal(numbers, np.round(numbers)):
-        raise ProblemError("frame_numbers must be whole numbers; got fractions.")
-    _require_few_holes(float(numbers[-1]) - float(numbers[0]) + 1, len(numbers))
-    return np.asarray(numbers - numbers[0], dtype=np.int64)
 
 
 def _require_few_holes(frames: float, rows: int) -> None:
@@ -139,10 +137,3 @@ def _quantum(times: FloatArray) -> float:
     gaps = np.diff(np.unique(np.append(0.0, steps)))
     counts = np.round(steps / float(np.min(gaps[gaps > noise])))
     return float(times[-1] - times[0]) / float(np.sum(counts))
-
-
-def _fit_rate(times: FloatArray, frame: IntArray) -> tuple[float, FloatArray]:
-    """Return the rate by a straight line, to nine digits, and how far off times are [frames]."""
-    t, n = times - times.mean(), frame - frame.mean()
-    rate = float(n @ n) / float(n @ t)
-    return float(f"{rate:.9g}"), rate * t - n

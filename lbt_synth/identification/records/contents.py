@@ -211,13 +211,19 @@ def _read_text(out: Contents, content: bytes) -> None:
     lines = [line.strip("\r\n ") for line in content.decode("utf-8-sig").splitlines()]
     rows = [(n, line) for n, line in enumerate(lines, start=1) if line and line[0] != "#"]
     comments = [(n, line.lstrip("# ")) for n, line in enumerate(lines, start=1) if line[:1] == "#"]
-    for _, comment in comments:
-        _add_comment(out, comment)
+    for _, comment in comments:  # such as frame_rate_hz = 1000
+        sign = min((at for at in map(comment.find, ":=") if at > 0), default=0)
+        key, value = comment[:sign].strip(), comment[sign + 1 :].strip()
+        fact = recognise_fact(key) if value else None
+        if fact == "unit" and " " in value:
+            out.notes.append(f"the comment {key} was not taken for a unit: {value!r}")
+        elif fact is not None:
+            out.add_fact(fact, value, f"the comment {key}")
     if not rows:
         raise TelemetryError("it has no rows.")
-    sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
-    table = [[cell.strip(' "') for cell in line.split(sign)] for _, line in rows]
-    above = next((c.split(sign) for n, c in comments[::-1] if n < rows[0][0]), [])
+    delimiter = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
+    table = [[cell.strip(' "') for cell in line.split(delimiter)] for _, line in rows]
+    above = next((c.split(delimiter) for n, c in comments[::-1] if n < rows[0][0]), [])
     names = [""] * len(table[0])
     if _is_heading(table[0]):
         names = table.pop(0)
@@ -253,17 +259,6 @@ def _parse_number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return float("nan")
-
-
-def _add_comment(out: Contents, comment: str) -> None:
-    """Add the fact of a comment such as frame_rate_hz = 1000."""
-    sign = min((at for at in map(comment.find, ":=") if at > 0), default=0)
-    key, value = comment[:sign].strip(), comment[sign + 1 :].strip()
-    if value and (fact := recognise_fact(key)) is not None:
-        if fact == "unit" and " " in value:
-            out.notes.append(f"the comment {key} was not taken for a unit: {value!r}")
-        else:
-            out.add_fact(fact, value, f"the comment {key}")
 
 
 _READERS: dict[str, Callable[[Contents, bytes], None]] = {

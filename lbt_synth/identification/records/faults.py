@@ -39,17 +39,11 @@ def mark(stretches: IntArray, frames: int) -> BoolArray:
     return out
 
 
-def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
-    """Return (start, stop) of each run of one value, single values included, (r, 2)."""
-    same = (series[1:] == series[:-1]) & good[1:] & good[:-1]
-    starts = np.concatenate([[0], np.flatnonzero(~same) + 1])
-    stops = np.concatenate([starts[1:], [len(series)]])
-    return np.asarray(np.column_stack([starts, stops])[good[starts]], dtype=np.int64)
-
-
 def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find frames of a value that is held for longer than chance or quantisation hold it."""
-    stretches = equal_runs(series, good)
+    same = (series[1:] == series[:-1]) & good[1:] & good[:-1]
+    ends = np.concatenate([[0], np.flatnonzero(~same) + 1, [len(series)]])
+    stretches = np.column_stack([ends[:-1], ends[1:]])[good[ends[:-1]]]  # single values, too
     lengths = stretches[:, 1] - stretches[:, 0]
     # the chance that a value is held on: a slow series in steps stays on a level longer than its
     # mean run tells, so the largest one of any length counts

@@ -125,11 +125,10 @@ def load_record(
     >>> seen.frame_rate_hz, seen.usable.tolist(), seen.measurements[0].round(2).tolist()
     (1000.0, [False, True, False], [29.89])
     """
-    if isinstance(source, Telemetry):
-        telemetry, name = source, str(source.metadata.get("name", "telemetry"))
-    else:
-        advice = "Take loop_record for series in memory."
-        telemetry, name = None, str(file_path(source, "a record", advice))
+    telemetry = source if isinstance(source, Telemetry) else None
+    if telemetry is None:
+        file_path(source, "a record, unless loop_record makes it of arrays,")
+    name = str(source if telemetry is None else telemetry.metadata.get("name", "telemetry"))
     stated: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,
@@ -190,7 +189,10 @@ def _telemetry_record(
     facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
     roles: Roles = {}
-    for role, (find, word) in _MATRICES.items():
+    for role, find, word in (
+        ("measurements", _inverse_response, "the inverse of the interaction matrix"),
+        ("commands", _influence, "the influence matrix"),
+    ):
         recorded_unit = getattr(telemetry, f"{role.removesuffix('s')}_unit")
         if (series := getattr(telemetry, role)) is None:
             continue
@@ -252,21 +254,16 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
             "coefficients. Multiply them by the reconstructor of the loop.",
             in_python="As Telemetry(measurements=slopes @ reconstructor.T).",
         )
-    if response is None or _is_gains(response, seen):  # the record has a sensor gain of its own
-        return None
+    # of other programs, the units are in the matrix
+    gains = np.ones(n) if response is None or _FOREIGN in seen.metadata else np.diag(response)
+    if response is None or (np.array_equal(response, np.diag(gains)) and np.all(gains > 0)):
+        return None  # the record has a sensor gain of its own
     if q < n or np.linalg.cond(response) > _CONDITION:
         raise ProblemError(
             f"the interaction matrix {response.shape} has no inverse: the {q} measurements do not "
             f"tell {n} modes apart. Give telemetry of tip and tilt alone."
         )
     return np.asarray(np.linalg.pinv(response), dtype=np.float64)
-
-
-def _is_gains(response: FloatArray, seen: Telemetry) -> bool:
-    """Whether a response is a gain for each mode; units of other programs are in their matrix."""
-    gains = np.diag(response) if _FOREIGN not in seen.metadata else np.ones(seen.modes)
-    is_square = response.shape == (seen.modes, seen.modes)
-    return is_square and np.array_equal(response, np.diag(gains)) and bool(np.all(gains > 0))
 
 
 def _influence(seen: Telemetry) -> FloatArray | None:
@@ -279,12 +276,6 @@ def _influence(seen: Telemetry) -> FloatArray | None:
             in_python="Give it to Telemetry(influence_matrix=...).",
         )
     return None if influence is None or np.array_equal(influence, np.eye(n)) else influence
-
-
-_MATRICES = {  # from what was recorded to modes
-    "measurements": (_inverse_response, "the inverse of the interaction matrix"),
-    "commands": (_influence, "the influence matrix"),
-}
 
 
 def _join_commands(contents: Contents, path: Path) -> None:

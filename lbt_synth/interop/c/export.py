@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +105,14 @@ def _write(
             f"{place.name!r}.",
             path=place,
         )
-    prefix = _require_identifier(place.stem if name is None else name)
+    prefix = place.stem if name is None else name
+    # these are identifiers of C and C++ that no standard reserves
+    if not (isinstance(prefix, str) and _IDENTIFIER.fullmatch(prefix) and len(prefix) <= _LONGEST):
+        raise ProblemError(
+            f"the prefix of the C names must begin with a letter, hold letters, digits and single "
+            f"underscores between them, and have at most {_LONGEST} characters; got {prefix!r}. "
+            "Give another name."
+        )
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         undefined=StrictUndefined,
@@ -137,17 +144,6 @@ def _write(
         environment.get_template(f"controller.{ending}.jinja").render(values) for ending in "ch"
     )
     return {place: source.encode("ascii"), header: declarations.encode("ascii")}
-
-
-def _require_identifier(name: str) -> str:
-    """Return a prefix whose names are C and C++ identifiers that no standard reserves."""
-    if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name) or len(name) > _LONGEST:
-        raise ProblemError(
-            f"the prefix of the C names must begin with a letter, hold letters, digits and single "
-            f"underscores between them, and have at most {_LONGEST} characters; got {name!r}. "
-            "Give another name."
-        )
-    return name
 
 
 def _exact_constant(value: float, *, single: bool) -> str:
@@ -279,11 +275,6 @@ def _tables(terms: SourceTerms) -> dict[str, Any]:
     return {"gains": gains, "count": count, "due": list(due), "first": first, "sets": len(sets)}
 
 
-def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
-    """Return the terms in the text of the source, as a compiler reads it."""
-    return read_source(next(iter(files.values())).decode("ascii"), like)
-
-
 def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
     """Return what the certificate says of the source."""
     form = {"form": "estimator" if terms.applied else "plain"}
@@ -302,7 +293,7 @@ TARGET = Target(
     },
     round=_round,
     write=_write,
-    read=_read,
+    read=lambda files, like: read_source(next(iter(files.values())).decode("ascii"), like),
     computed=as_computed,
     start=lambda terms, _: RunningSource(terms),
     join=join,

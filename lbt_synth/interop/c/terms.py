@@ -346,8 +346,7 @@ def read_source(text: str, like: SourceTerms) -> SourceTerms:
         sums[name].append(row)
     predicted, command = (np.stack(sums[name], axis=1) for name in "nu")
     innovation = np.stack(sums[""], axis=1)[:, :, : s + m] if sums[""] else like.innovation
-    read = like.read
-    gains = {NONE: predicted[:, :, s + m :]}
+    gains, read = {NONE: predicted[:, :, s + m :]}, like.read
     if "first" in tables:
         gains, read = _read_gains(tables, like)
     return replace(
@@ -391,8 +390,6 @@ def used_readings(terms: SourceTerms, missing: frozenset[str]) -> BoolArray:
 
 
 def count_gains(terms: SourceTerms) -> int:
-    """Return how many gains stand in the table of a source, 0 where they are written out."""
-    if not terms.tabled:
-        return 0
+    """Return how many gains stand in the table of a source."""
     readings = sum(int(np.count_nonzero(used_readings(terms, some))) for some in terms.gains)
     return readings * int(terms.gains[NONE].shape[1])

@@ -56,7 +56,8 @@ class AppliedFilter:
     """
 
     def __init__(self, matrix: ArrayLike, delay_frames: float = 2.0, limit: float = np.inf) -> None:
-        self._matrix = np.atleast_2d(np.asarray(matrix, dtype=np.float32))
+        cube = np.atleast_2d(np.asarray(matrix, dtype=np.float32))
+        self._matrix = cube.reshape(len(cube), -1)
         latency = np.float32(1 + delay_frames)
         self._whole, self._limit = int(latency), np.float32(limit)
         self._older = np.float32(latency - self._whole)  # weight of the older of two frames
@@ -266,11 +267,6 @@ def _round(designs: Sequence[Design], *, steps: int | None, **_: Any) -> list[_N
     return [(-one.taps(count).swapaxes(0, 1).astype(np.float32), delay) for one in filters]
 
 
-def _as_computed(design: Design, numbers: _Numbers) -> Written:
-    """Return what is proved of a matrix."""
-    return predictive_filter(design).as_computed(-numbers[0].swapaxes(0, 1).astype(np.float64))
-
-
 def _join(numbers: Sequence[_Numbers], parts: Sequence[ModeDesign], count: int) -> _Numbers:
     """Return the matrix of all modes; refuse one that no computer multiplies in a frame."""
     (first, delay), *_ = numbers
@@ -297,7 +293,7 @@ def _write(
     from astropy.io import fits
 
     modes, steps, _columns = whole[0].shape
-    unit = fits.PrimaryHDU(data=_flat(whole))
+    unit = fits.PrimaryHDU(data=whole[0].reshape(modes, -1))
     unit.header["METHOD"] = design.method, "synthesis"
     unit.header["STEPS"] = steps, "frames of history, the newest first"
     unit.header["MODES"] = modes, "modes of a frame"
@@ -307,11 +303,6 @@ def _write(
     buffer = io.BytesIO()
     unit.writeto(buffer)
     return {place: buffer.getvalue()}
-
-
-def _flat(numbers: _Numbers) -> NDArray[np.float32]:
-    """Return the matrix (m, steps * m), the newest frame first."""
-    return numbers[0].reshape(len(numbers[0]), -1)
 
 
 def _read(files: Mapping[Path, bytes], like: _Numbers) -> _Numbers:
@@ -326,8 +317,10 @@ TARGET = Target(
     round=_round,
     write=_write,
     read=_read,
-    computed=_as_computed,
-    start=lambda numbers, limit: AppliedFilter(_flat(numbers), numbers[1], limit),
+    computed=lambda design, numbers: predictive_filter(design).as_computed(
+        -numbers[0].swapaxes(0, 1).astype(np.float64)
+    ),
+    start=lambda numbers, limit: AppliedFilter(numbers[0], numbers[1], limit),
     join=_join,
     facts=lambda whole, **_: {
         "steps": whole[0].shape[1],

@@ -23,13 +23,10 @@ _CONVENTION = (
 )
 
 
-def _round(designs: Sequence[Design]) -> list[SourceTerms]:
+def _round(designs: Sequence[Design], **_: Any) -> list[SourceTerms]:
     """Return the sums of the textbook form of a controller."""
-    return [_textbook_terms(design.controller.to_statespace()) for design in designs]
-
-
-def _textbook_terms(textbook: StateSpace) -> SourceTerms:
-    return controller_terms(command_as_state(textbook))
+    textbooks = (design.controller.to_statespace() for design in designs)
+    return [controller_terms(command_as_state(textbook)) for textbook in textbooks]
 
 
 def _write(
@@ -62,7 +59,8 @@ def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
 
     buffer: Any = io.BytesIO(next(iter(files.values())))  # as for savemat
     form = loadmat(buffer)["textbook"][0, 0]
-    return _textbook_terms(StateSpace(**{name: form[name] for name in "ABCD"}, dt_s=like.dt_s))
+    textbook = StateSpace(**{name: form[name] for name in "ABCD"}, dt_s=like.dt_s)
+    return controller_terms(command_as_state(textbook))
 
 
 TARGET = Target(

@@ -69,7 +69,7 @@ loop:
 class PolFilter:
     """A controller in the units of pyRTC's commands."""
 
-    hardware: LoopHardware  # of its loop
+    hardware: LoopHardware  # of its loop, whose sensor and mirror are of modes
     delay_frames: int  # after which pyRTC takes a command away
     response: FloatArray  # from commands to measurements, (m, m): its interaction matrix
     # what the last commands, u(k-1) first, are of the correction that measurement k sees, (frames,)
@@ -90,9 +90,8 @@ class PolFilter:
 
     def as_computed(self) -> Written:
         """Return the controller that pyRTC's loop computes, and what its arithmetic adds."""
-        R, m = self.reconstructor, len(self.response)
-        modal = replace(self.hardware, sensor_matrix=None, influence_matrix=None, modes=m)
-        controller, entry = filter_of_history(modal, self.system)
+        R = self.reconstructor
+        controller, entry = filter_of_history(self.hardware, self.system)
         controller = replace(controller, B=controller.B @ R)
 
         def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
@@ -162,7 +161,7 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
     taps = np.zeros(max(delay, len(hardware.mirror_taps)))
     taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
     return PolFilter(
-        hardware=hardware,
+        hardware=modal,
         delay_frames=delay,
         response=response,
         taps=taps,

@@ -171,7 +171,7 @@ class Modes:
 
 def make_modes(setup: EndToEndSetup) -> Modes:
     """Compute Karhunen-Loeve modes of the influence functions, after tip and tilt."""
-    mask = _make_pupil(setup, _make_parameters(setup)).A
+    mask = _make_pupil(setup)[1].A
     functions, _, _, _ = _make(
         "lib.compute_zonal_ifunc:compute_zonal_ifunc",
         setup.pixels,
@@ -194,14 +194,12 @@ def make_modes(setup: EndToEndSetup) -> Modes:
     return Modes(mask=mask > 0, shapes=np.ascontiguousarray(shapes[: setup.modes], np.float32))
 
 
-def _make_parameters(setup: EndToEndSetup) -> Any:
-    name = "data_objects.simul_params:SimulParams"
-    return _make(name, setup.pixels, setup.pixel_m, time_step=1 / setup.hardware.frame_rate_hz)
-
-
-def _make_pupil(setup: EndToEndSetup, parameters: Any) -> Any:
+def _make_pupil(setup: EndToEndSetup) -> tuple[Any, Any]:
+    """Return the parameters of a simulation, and its pupil."""
+    name, step_s = "data_objects.simul_params:SimulParams", 1 / setup.hardware.frame_rate_hz
+    parameters = _make(name, setup.pixels, setup.pixel_m, time_step=step_s)
     name = "data_objects.pupilstop:Pupilstop"
-    return _make(name, parameters, mask_diam=1.0, obs_diam=setup.obstruction)
+    return parameters, _make(name, parameters, mask_diam=1.0, obs_diam=setup.obstruction)
 
 
 class Optics:
@@ -213,8 +211,7 @@ class Optics:
         self._time_ns = 0
         self._weather: list[Any] = []  # seeing, speed and direction of the wind
         self._where = np.nonzero(modes.mask)
-        self._parameters = _make_parameters(setup)
-        self._pupil = _make_pupil(setup, self._parameters)
+        self._parameters, self._pupil = _make_pupil(setup)
         self._commands = self._make_input(np.zeros(len(modes.shapes)))
         mirror = self._make_mirror()
         inputs = {"common_layer_list": [self._pupil, mirror.outputs["out_layer"]]}

@@ -17,7 +17,6 @@ from lbt_synth.interop.specula.optics import (
     RAMP_FRAMES,
     Calibration,
     EndToEndSetup,
-    Modes,
     Optics,
     calibrate,
 )
@@ -296,21 +295,16 @@ def _run_frames(
         if row >= 0:
             strehl[row], frame = optics.image()
             psf = psf + frame
-            residual, others[row] = _measure_residual(modes, optics)
+            phase = optics.phase_nm()
+            residual = modes.coefficients(phase)
+            rest = phase - residual[:2].astype(np.float32) @ modes.shapes[:2]
+            others[row] = np.abs(np.mean(np.exp(1j * turn * rest))) ** 2
             for name, value in zip(out, (y, command, residual), strict=True):
                 out[name][row] = value
         if progress is not None:
             progress(1)
 
     taps = optics.setup.hardware.mirror_taps
+    turn = 2 * np.pi / (1e3 * optics.setup.imaging_wavelength_um)
     run_frames(controller, measure, expose, frames=len(tilts), shape=(n,), taps=taps)
     return {**out, "strehl_series": strehl, "other_modes_series": others, "psf": psf / kept}
-
-
-def _measure_residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:
-    """Return the residual of each mode (modes,), and the Strehl ratio without tip and tilt."""
-    phase = optics.phase_nm()
-    coefficients = modes.coefficients(phase)
-    rest = phase - coefficients[:2].astype(np.float32) @ modes.shapes[:2]
-    turn = 2 * np.pi / (1e3 * optics.setup.imaging_wavelength_um)
-    return coefficients, float(np.abs(np.mean(np.exp(1j * turn * rest))) ** 2)

@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import DimensionError
 from lbt_synth.models.loop_hardware import LoopHardware, require_loop_rate
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficient_rows, section_drives
@@ -42,11 +42,7 @@ class PlantParts:
     def __post_init__(self) -> None:
         n = self.hardware.modes
         for model in self.turbulence:
-            if not isinstance(model, ARModel):
-                raise ProblemError(
-                    f"turbulence must be an ARModel, or one per mode; got {type(model).__name__}.",
-                    in_python="For an Atmosphere try ar1_turbulence(air, frame_rate_hz=...).",
-                )
+            require_instance(model, ARModel, "turbulence")
         if len(self.turbulence) != n or any(m.coefficients.ndim > 1 for m in self.turbulence):
             raise DimensionError(
                 f"turbulence must be one ARModel, or one per mode ({n}); got "

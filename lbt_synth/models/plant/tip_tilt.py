@@ -228,7 +228,7 @@ def tip_tilt_plant(
     frame_rate_hz : float
         Frame rate [Hz].
     turbulence : ARModel or sequence of ARModel
-        Turbulence of each mode; one model serves all modes.
+        Turbulence of each mode, as :func:`ar1_turbulence` makes it; one model serves all modes.
     noise_nm : float, (q,) or (q, q) array_like
         Standard deviation of the measurement noise per frame, one for all measurements or one
         per measurement [nm], or its covariance [nm^2].
@@ -379,9 +379,7 @@ def spread_plant(plant: TipTiltPlant, *, half_width_hz: float, lines: int = 5) -
     >>> [line.frequency_hz for line in spread.vibrations]
     [19.25, 19.75, 20.25, 20.75]
     """
-    parts = require_instance(
-        plant, TipTiltPlant, "plant"
-    ).parts()  # refuses the memory of a mixed filter
+    parts = plant.parts()  # refuses the memory of a mixed filter
     if not plant.vibrations:
         raise ProblemError(
             "a frequency prior needs a plant with a vibration; got one without any. Try "
@@ -391,3 +389,50 @@ def spread_plant(plant: TipTiltPlant, *, half_width_hz: float, lines: int = 5) -
     spread = tuple(line for share in shares for line in share)
     motions = tuple(motion for motion in plant.motions for _ in range(lines))
     return assemble(replace(parts, vibrations=spread, motions=motions))
+
+
+def mean_plant(plants: Sequence[TipTiltPlant], weights: Sequence[float]) -> TipTiltPlant:
+    """Return the plant whose spectra are the weighted means of those of plants of one loop.
+
+    Lines that overlap become one of their power, and the turbulence has the shape of that plant
+    whose driving noise weighs most. The sensor gain is the geometric mean.
+    """
+    shares, hardware = np.array(weights) / np.sum(weights), plants[0].hardware
+    gains = np.array([np.diag(plant.hardware.sensor) for plant in plants])
+    gain = np.exp(np.mean(np.log(gains), axis=0))
+    noises = [p.R * np.outer(gain / own, gain / own) for p, own in zip(plants, gains, strict=True)]
+    air = []
+    for models in zip(*(plant.turbulence for plant in plants), strict=True):
+        powers = shares * [model.driving_rms_nm**2 for model in models]
+        strongest = models[int(np.argmax(powers))]
+        air.append(replace(strongest, driving_rms_nm=float(np.sqrt(np.sum(powers)))))
+    lines = [
+        replace(line, rms_nm=float(np.sqrt(share)) * line.rms_nm)
+        for share, plant in zip(shares, plants, strict=True)
+        for line in plant.vibrations
+    ]
+    return assemble(
+        PlantParts(
+            hardware=replace(hardware, sensor_matrix=np.diag(gain)),
+            turbulence=tuple(air),
+            vibrations=tuple(_merge(lines)),
+            noise_factor=np.linalg.cholesky(np.tensordot(shares, noises, 1)),
+        )
+    )
+
+
+def _merge(lines: Sequence[Vibration]) -> list[Vibration]:
+    """Return lines, with one for those of a direction that are nearer than their half widths."""
+    merged = list[Vibration]()
+    for line in sorted(lines, key=lambda one: (one.direction, one.sections, one.frequency_hz)):
+        last = merged[-1] if merged else line
+        half_hz, wider_hz = sorted(one.damping * one.frequency_hz for one in (last, line))
+        same = (last.direction, last.sections) == (line.direction, line.sections)
+        is_near = line.frequency_hz - last.frequency_hz < half_hz and wider_hz < 2 * half_hz
+        if merged and same and is_near:
+            weak, strong = sorted((merged.pop(), line), key=lambda one: one.rms_nm)
+            rms_nm = float(np.hypot(weak.rms_nm, strong.rms_nm))
+            move_hz = (weak.rms_nm / rms_nm) ** 2 * (weak.frequency_hz - strong.frequency_hz)
+            line = replace(strong, frequency_hz=strong.frequency_hz + move_hz, rms_nm=rms_nm)
+        merged.append(line)
+    return merged

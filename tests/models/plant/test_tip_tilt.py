@@ -215,7 +215,7 @@ def test_wrong_parts_are_refused(plant):
         ({"delay_frames": 20.5}, "delay_frames must be at most 20; got 20.5"),
         ({"sensor_gain": 0}, "sensor_gain must be above 0"),
         (unequal, "to match sensor_matrix"),
-        (blind, "must see something that the mirror moves"),
+        (blind, "must see something that influence_matrix moves"),
         ({"sensor_matrix": [[np.nan, 0], [0, 1]]}, "sensor_matrix must be finite"),
         ({"turbulence": [AR1] * 3}, r"one per mode \(2\); got 3"),
         ({"turbulence": replace(AR1, frame_rate_hz=500)}, "must be sampled at the loop's 800 Hz"),
@@ -223,7 +223,7 @@ def test_wrong_parts_are_refused(plant):
         ({"vibrations": [replace(line, frequency_hz=450)]}, "below the Nyquist"),
         ({"vibrations": line}, "vibrations must be a list; got Vibration"),
         ({"vibrations": [1]}, "each vibration must be a Vibration; got int"),
-        ({"turbulence": None}, "turbulence must be an ARModel, .* got NoneType"),
+        ({"turbulence": None}, "turbulence must be an ARModel; got NoneType"),
         ({"noise_nm": 1e-200}, "is singular. Every measurement needs noise"),
     ]
     require_refusals((partial(small_plant, **c), ProblemError, words) for c, words in rows)
@@ -232,7 +232,6 @@ def test_wrong_parts_are_refused(plant):
     spread, fast = lbt.models.spread_plant, retuned_plant(plant, 379.0)
     seen, gain = example_plant(), np.zeros((1, 2, 3))
     rows = [
-        (lambda: spread(suite, half_width_hz=1), ProblemError, "plant must be a TipTiltPlant"),
         (lambda: spread(small_plant(), half_width_hz=1), ProblemError, "needs a plant with a vibr"),
         (lambda: spread(plant, half_width_hz=20), ProblemError, "must be below 20; got 20. All"),
         (lambda: spread(plant, half_width_hz=1, lines=65), ProblemError, "must be at most 64"),
