@@ -24,7 +24,7 @@ LINES = {
     "loop": 3975,
     "methods": 802,
     "models": 3781,
-    "report": 3531,
+    "report": 3534,
     "storage": 1163,
     "studies": 3171,
     "errors, validation": 564,
