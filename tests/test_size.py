@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 205,
     "public names": 147,
     "tuned constants": 504,
-    "lines of tests": 24847,
+    "lines of tests": 24862,
     "lines of benchmarks": 3998,
     "words of docs": 60221,
 }

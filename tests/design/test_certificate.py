@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.design.certificate import certify_error, certify_filter, certify_infeasible
+from lbt_synth.design.certificate import (
+    Check,
+    certify_error,
+    certify_filter,
+    certify_infeasible,
+    say_checks,
+)
 from lbt_synth.errors import CertificateError, DimensionError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.infeasibility_proof import Witness
@@ -77,3 +83,9 @@ def test_what_is_no_witness_of_the_problem_is_refused():
     words = r"1 rows of states, 2 rows of disturbances .*; got \(2, 1\) and \(2, 1\)"
     with pytest.raises(DimensionError, match=words):
         certify_infeasible(problem, 1.0, wide)
+
+
+def test_a_sentence_counts_the_checks():
+    good, bad = (Check("norm", value, 1.0, "by hand") for value in (0.5, 2.0))
+    assert say_checks([good, good]) == "2 of 2 checks passed."
+    assert say_checks([good, bad]) == "1 of 2 checks passed; 1 FAILED."

@@ -1,6 +1,7 @@
 """Records from files and telemetry: facts, units, spectra, clocks, and what is refused."""
 
 import hashlib
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -33,7 +34,9 @@ def test_telemetry_of_ours(tmp_path, name):
     seen = lbt.load_record(file)
     assert np.array_equal(seen.measurements, run.measurements[0])
     assert np.array_equal(seen.mirror_taps, path.mirror_taps)
-    assert seen.source == str(file)
+    assert (seen.source, seen.shown_unit) == (str(file), "nm")
+    mas = lbt.files.save_telemetry(tmp_path / f"m{name}", replace(telemetry, shown_unit="mas"))
+    assert lbt.load_record(mas).shown_unit == "mas"
     assert not any("of another program" in note for note in seen.notes)
     assert lbt.load_record(file, axes=[1]).axes == 1
     words = f"{name}: .*neither columns nor commands"
