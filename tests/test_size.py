@@ -16,9 +16,9 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3200,
     "config": 1611,
-    "design": 6007,
+    "design": 6006,
     "files": 1273,
-    "identification": 8941,
+    "identification": 8959,
     "interop": 3694,
     "linear": 4697,
     "loop": 3975,

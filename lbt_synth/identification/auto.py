@@ -195,18 +195,13 @@ def design_from_record(
     if not designs:
         raise NumericalError(f"no design holds the loop: {'; '.join(held_out.notes)}.")
     if method is None:
-        rows = {row.name: row.replayed for row in held_out.entries if row.name in designs}
-        title, note = choose_method({name: data for name, data in rows.items() if data})
-        method = next(name for name in names if method_named(name).title == title)
+        method, note = _choose(held_out, designs, names)
         notes.append(note)
     title, alone = method_named(method).title, {method: requests[method]}
     if separate_axes:
         table, _ = compare_designs(record, mixed, alone, imaging=imaging, channels=beside)
-        if row := table.row(title):
-            entries = (*held_out.entries, replace(row, name=f"{title}, axes mixed"))
-            held_out = replace(held_out, entries=entries)
-            mixes = row.replayed.text if row.replayed else "an unknown residual"
-            notes.append(f"with axes that mix, the {title} leaves {mixes} on unseen data")
+        held_out, note = _add_mixed(held_out, table.row(title), title)
+        notes.append(note)
     step(1)
     model, request = identify(record, start=mixed, **options), design_request(method, {})
     model = model.separated() if separate_axes else model
@@ -218,15 +213,12 @@ def design_from_record(
     made, added_nm, price = design_for_gains(
         model, design_of, allowed, command_scale_known=command_scale_known
     )
-    known = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
-    tested = held_out
+    known, tested = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1), held_out
     if added_nm.any():
         tested, designs = compare_designs(record, half, alone, added_nm=added_nm, **inputs)
         notes.append(_say_price(price, tested.row(title), held_out.row(title)))
     if of_record := request.method.of_record:
-        past = designs.get(title, made)
-        saved = past.claims["fit_share"] - made.claims["fit_share"]
-        made = replace(made, claims={**made.claims, **_claims(tested, title, saved)})
+        made = _with_claims(made, designs.get(title, made), tested, title)
     step(1)
     return RecordedDesign(
         model=model,
@@ -242,6 +234,32 @@ def design_from_record(
             *note_drift(record, model.plant(), made.close(model.hardware)),
         ),
     )
+
+
+def _choose(
+    table: PredictionTable, designs: Mapping[str, Design], names: Sequence[str]
+) -> tuple[str, str]:
+    """Choose a method among those whose design was tested; return why, too."""
+    rows = {row.name: row.replayed for row in table.entries if row.name in designs}
+    title, note = choose_method({name: data for name, data in rows.items() if data})
+    return next(name for name in names if method_named(name).title == title), note
+
+
+def _add_mixed(
+    table: PredictionTable, row: PredictionRow | None, title: str
+) -> tuple[PredictionTable, str]:
+    """Return a table with the row of a method whose axes mix, and what it leaves in words."""
+    mixes = row.replayed.text if row and row.replayed else "an unknown residual"
+    if row:
+        mixed = replace(row, name=f"{title}, axes mixed")
+        table = replace(table, entries=(*table.entries, mixed))
+    return table, f"with axes that mix, the {title} leaves {mixes} on unseen data"
+
+
+def _with_claims(made: Design, past: Design, table: PredictionTable, title: str) -> Design:
+    """Return a predictor with what that of the first half, in a table, lets it claim."""
+    saved = past.claims["fit_share"] - made.claims["fit_share"]
+    return replace(made, claims={**made.claims, **_claims(table, title, saved)})
 
 
 def _say_price(price: str, now: PredictionRow | None, before: PredictionRow | None) -> str:

@@ -346,8 +346,7 @@ def _find_gains(
         if differenced:
             rejection /= 4 * np.sin(np.pi * nodes / rate) ** 2
         spectra = _checked_spectra(density, nodes, differenced=differenced)
-        variances = (spectra * weights) @ rejection.T
-        variances += np.outer(noise_nm2, propagated)
+        variances = (spectra * weights) @ rejection.T + np.outer(noise_nm2, propagated)
         if np.any(variances[:, 0] == 0):
             raise ProblemError(
                 "every mode must have turbulence, vibration or noise; got none in mode "
