@@ -32,7 +32,7 @@ from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import design_request
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fact, fact_table, facts, json_record, row_table
+from lbt_synth.storage.rows import Facts, fact, fact_table, facts, json_record, row_table
 
 
 def run_design(arguments: Namespace) -> Report:
@@ -74,7 +74,7 @@ def describe_design(report: Report, design: Design) -> None:
             margins = [loop_margins(close_loop(design.hardware, design))]
             report.data["margins"] = json_record(*margins)
     fragile = [f"{text[0].upper()}{text[1:]}" for one in margins for text in one.fragilities]
-    report.verdict = [*fragile, *(report.verdict or [_say_model(design)])]
+    report.verdict = [*fragile, *(report.verdict or [_say_model(design, records[0])])]
     report.verdict += [f"It {one.survival}" for one in margins if not one.fragilities]
     add_certificate(report, design)
     report.add_records(*records)
@@ -85,12 +85,12 @@ def describe_design(report: Report, design: Design) -> None:
     report.add_rows("checks", "Certificate", design.certificate.checks)
 
 
-def _say_model(design: Design) -> str:
+def _say_model(design: Design, facts: Facts) -> str:
     """Return what a design promises in its own model, for one without a truth."""
     title = f"The {design_title(design.method)}"
     if design.plant is None and (bought := say_accelerometers(design)):
         return f"{title} leaves {bought}, on unseen frames of its record."
-    residual_nm = design.derived().get("residual_nm", design.expected_residual_nm)
+    residual_nm = facts.values.get("residual_nm", design.expected_residual_nm)
     if residual_nm is not None and isfinite(residual_nm):
         place = "on unseen frames of its record" if design.plant is None else "in its model"
         return f"{title} leaves {nm_text(residual_nm, '.1f')} rms {place}."

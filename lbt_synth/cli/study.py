@@ -21,11 +21,7 @@ from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.executors import choose_engine
 from lbt_synth.storage.words import duration_text, listing_text
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
-from lbt_synth.studies.study.statistics import (
-    study_statistics,
-    summary_tables,
-    worst_table,
-)
+from lbt_synth.studies.study.statistics import study_statistics, summary_tables, worst_table
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import integer
 

@@ -249,10 +249,26 @@ def whole_view(view: View, start: Config) -> View:
     """Return a view with what its designs leave, too, which takes longer than their curves."""
     if view.is_whole:
         return view
-    shown = {
-        name: with_image(one, view.designs[name], view.config, start, view.shift_hz)
-        for name, one in view.shown.items()
-    }
+    truth, gain = view.config.truth, view.config.truth.sensor_gain
+    # the true lines have moved by a shift from where they are at the start, and move on
+    lines = {name: getattr(start.truth, name) for name in ("vibrations", "frequency_errors_hz")}
+    low, high = frequency_errors(start)[[0, -1]]
+    shifts = np.unique([*np.linspace(low, high, _SHIFTS), view.shift_hz])
+    now, shown = int(np.searchsorted(shifts, view.shift_hz)), dict[str, Shown]()
+    for name, design in view.designs.items():
+        image = robustness_map(
+            design,
+            replace(truth, **lines),
+            view.config.imaging,
+            hardware=view.config.hardware,
+            errors_hz=shifts,
+            sensor_gains=[gain],
+        )
+        shown[name] = Shown(
+            curves={**view.shown[name].curves, STREHL: (shifts, 100 * image.strehl[0, 0])},
+            residual_nm=float(image.residual_nm[0, 0, now]),
+            strehl=float(image.strehl[0, 0, now]),
+        )
     return replace(view, shown=shown)
 
 
@@ -286,32 +302,6 @@ def loop_curves(design: Design, config: Config) -> dict[str, Curve]:
         error = spectral_norms(design.error_system().frequency_response(f))
         curves["Estimation error"] = f, shown_unit("nm")[1] * error
     return curves
-
-
-def with_image(
-    shown: Shown, design: Design, config: Config, start: Config, shift_hz: float
-) -> Shown:
-    """Return what is shown with the residual, the Strehl ratio, and its curve over the shift.
-
-    The true lines have moved by a shift from where they are at the start, and move on.
-    """
-    lines = {name: getattr(start.truth, name) for name in ("vibrations", "frequency_errors_hz")}
-    low, high = frequency_errors(start)[[0, -1]]
-    shifts = np.unique([*np.linspace(low, high, _SHIFTS), shift_hz])
-    image = robustness_map(
-        design,
-        replace(config.truth, **lines),
-        config.imaging,
-        hardware=config.hardware,
-        errors_hz=shifts,
-        sensor_gains=[config.truth.sensor_gain],
-    )
-    now = int(np.searchsorted(shifts, shift_hz))
-    return Shown(
-        curves={**shown.curves, STREHL: (shifts, 100 * image.strehl[0, 0])},
-        residual_nm=float(image.residual_nm[0, 0, now]),
-        strehl=float(image.strehl[0, 0, now]),
-    )
 
 
 def explored_table(shown: Mapping[str, Shown]) -> Table:
