@@ -225,14 +225,16 @@ def _frequency_errors(
 @contextmanager
 def _name_matrices() -> Iterator[None]:
     """Call the matrices of a loop by their keys in the message of a ProblemError."""
+    keys = {"sensor_matrix": "sensor.matrix", "influence_matrix": "mirror.influence_matrix"}
     try:
         yield
     except ProblemError as error:
-        message = str(error).replace("sensor_matrix", "sensor.matrix")
-        message = message.replace("influence_matrix", "mirror.influence_matrix")
-        if isinstance(error, ConfigError) or message == str(error):
+        message, named = str(error), [name for name in keys if name in str(error)]
+        if isinstance(error, ConfigError) or not named:
             raise
-        raise ConfigError(message, path=message.split()[0]) from error
+        for name in named:
+            message = message.replace(name, keys[name])
+        raise ConfigError(message, path=keys[named[0]]) from error
 
 
 @_name_matrices()

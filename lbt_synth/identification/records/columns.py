@@ -81,7 +81,7 @@ def nm_unit(
     return unit._replace(base="nm", factor=factor)
 
 
-def shown_unit(text: str) -> str:
+def unit_to_show(text: str) -> str:
     """Return the unit in which people see what is measured in a unit, or in its powers."""
     word, unit = text.strip().lower(), parse_unit(text)
     return word if word in SHOWN or unit is None else unit.base

@@ -27,7 +27,7 @@ from lbt_synth.identification.records.columns import (
     nm_unit,
     parse_unit,
     same_unit,
-    shown_unit,
+    unit_to_show,
 )
 from lbt_synth.identification.records.contents import (
     CLOCKS,
@@ -461,7 +461,7 @@ def _build_spectrum(
     return SpectrumRecord(
         frequency_hz=clock_factor(frequency.unit, "Hz") * table[:, 0],
         density_nm2_hz=density,
-        shown_unit=shown_unit(density_unit),
+        shown_unit=unit_to_show(density_unit),
         notes=tuple(dict.fromkeys(contents.notes)),
         source=source,
         **facts,

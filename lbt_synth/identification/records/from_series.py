@@ -12,7 +12,7 @@ from lbt_synth.errors import DimensionError
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
-from lbt_synth.identification.records.columns import nm_unit, shown_unit
+from lbt_synth.identification.records.columns import nm_unit, unit_to_show
 from lbt_synth.identification.records.faults import Finding, findings_in
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models import PositionLoop
@@ -137,7 +137,7 @@ def loop_record(
         notes=tuple(dict.fromkeys(said)),
         diameter_m=diameter_m,
         obstruction=obstruction,
-        shown_unit=shown_unit(unit),
+        shown_unit=unit_to_show(unit),
         source=source,
     )
 

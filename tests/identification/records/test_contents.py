@@ -16,7 +16,12 @@ from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, TelemetryError
-from lbt_synth.identification.records.columns import clock_factor, nm_unit, parse_column, shown_unit
+from lbt_synth.identification.records.columns import (
+    clock_factor,
+    nm_unit,
+    parse_column,
+    unit_to_show,
+)
 from lbt_synth.identification.records.contents import read_contents
 
 RATE = 500.0
@@ -397,7 +402,7 @@ def test_units_of_wavefront(unit, kind, power, factor):
 def test_people_see_a_wavefront_in_the_unit_of_its_data_or_the_nearest_one():
     seen = {"nm": "nm", "m": "nm", "um": "um", "MAS": "mas", "arcsec": "mas", "urad": "urad"}
     seen |= {"mas^2/Hz": "mas", "nm_rthz": "nm", "rad": "mas"}
-    assert {unit: shown_unit(unit) for unit in seen} == seen
+    assert {unit: unit_to_show(unit) for unit in seen} == seen
 
 
 def test_units_of_clocks():
